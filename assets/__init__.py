@@ -1,0 +1,1 @@
+"""Data files that warp_gi ships."""

@@ -1,0 +1,1 @@
+"""Benchmarks of warp_gi; run them with ``warp-gi bench SUITE``."""

@@ -1,0 +1,121 @@
+"""Structs that two or more kernel modules share.
+
+Lengths in metres, radiance in W/(m^2 sr), colours linear Rec. 709, y up.
+Indices of -1 mean "none".
+"""
+
+import warp as wp
+
+WRAP_REPEAT = 0
+WRAP_CLAMP = 1
+WRAP_MIRROR = 2
+
+ENVIRONMENT_NONE = 0
+ENVIRONMENT_CONSTANT = 1
+ENVIRONMENT_MAP = 2
+
+EMITTER_TRIANGLE = 0
+EMITTER_POINT = 1
+EMITTER_SPOT = 2
+EMITTER_DIRECTIONAL = 3
+
+
+# One image in SceneData.texels. Row 0 is the bottom: texel (i, j) is centred
+# at u = (i + 0.5) / width, v = (j + 0.5) / height, v up.
+@wp.struct
+class Texture:
+    start: wp.int32  # first texel in SceneData.texels
+    width: wp.int32
+    height: wp.int32
+    wrap_u: wp.int32  # WRAP_*
+    wrap_v: wp.int32
+    srgb: wp.int32  # 1: red, green, blue are sRGB-coded; alpha never is
+
+
+# glTF 2.0 metallic-roughness. Texture fields index SceneData.textures.
+@wp.struct
+class Material:
+    base_color: wp.vec3
+    alpha: wp.float32
+    metallic: wp.float32
+    roughness: wp.float32  # perceptual; GGX alpha is its square
+    specular: wp.float32  # KHR_materials_specular factor; 0 is pure Lambert
+    normal_scale: wp.float32
+    emission: wp.vec3  # radiance
+    alpha_cutoff: wp.float32  # negative: opaque
+    double_sided: wp.int32  # 1: emits on both sides (every surface reflects on both)
+    base_color_texture: wp.int32  # RGB base colour, A coverage
+    metallic_roughness_texture: wp.int32  # G roughness, B metallic
+    normal_texture: wp.int32  # tangent space, x right, y up
+    emission_texture: wp.int32
+
+
+# Triangles in world space, at the current and at the previous frame.
+@wp.struct
+class Geometry:
+    points: wp.array(dtype=wp.vec3)  # [vertex]
+    previous_points: wp.array(dtype=wp.vec3)  # [vertex]
+    normals: wp.array(dtype=wp.vec3)  # [vertex] unit, or zero for flat shading
+    uvs: wp.array(dtype=wp.vec2)  # [vertex]
+    indices: wp.array(dtype=wp.vec3i)  # [triangle]
+    materials: wp.array(dtype=wp.int32)  # [triangle]
+    objects: wp.array(dtype=wp.int32)  # [triangle]
+    emitters: wp.array(dtype=wp.int32)  # [triangle] index in Emitters, or -1
+
+
+# The sky. A map is latitude-longitude: in environment space
+#   u = fract(atan2(x, -z) / 2 pi), v = acos(y) / pi (v = 0 is up, row 0 the top row),
+# which is Mitsuba's `envmap` with an identity to_world. Radiance is the bilinear
+# interpolation of texels, wrapping in u and clamped in v.
+@wp.struct
+class Environment:
+    kind: wp.int32  # ENVIRONMENT_*
+    radiance: wp.vec3  # of a constant sky; of a map the scale that multiplies texels
+    environment_from_world: wp.mat33
+    width: wp.int32
+    height: wp.int32
+    texels: wp.array(dtype=wp.vec3)  # [height * width]
+    alias_probability: wp.array(dtype=wp.float32)  # [height * width] alias table over texels
+    alias_index: wp.array(dtype=wp.int32)
+    pdf: wp.array(dtype=wp.float32)  # [height * width] probability of the texel (sums to 1)
+
+
+@wp.struct
+class Emitter:
+    kind: wp.int32  # EMITTER_*
+    triangle: wp.int32  # of EMITTER_TRIANGLE
+    position: wp.vec3  # of point and spot lights
+    direction: wp.vec3  # the way the light shines, of spot and directional lights
+    intensity: wp.vec3  # W/sr of point and spot lights; W/m^2 perpendicular to directional ones
+    cos_inner: wp.float32
+    cos_outer: wp.float32
+    range: wp.float32  # metres; light ends there; 0 is no limit
+
+
+@wp.struct
+class Emitters:
+    count: wp.int32
+    emitters: wp.array(dtype=Emitter)  # [count] emissive triangles first, then punctual lights
+    alias_probability: wp.array(dtype=wp.float32)  # [count] alias table of the current light sampler
+    alias_index: wp.array(dtype=wp.int32)
+    pdf: wp.array(dtype=wp.float32)  # [count] probability of selecting the emitter
+
+
+# What a ray query needs; see bvh.py.
+@wp.struct
+class Bvh:
+    mesh: wp.uint64  # wp.Mesh id, the CUDA path
+
+
+@wp.struct
+class SceneData:
+    bvh: Bvh
+    geometry: Geometry
+    materials: wp.array(dtype=Material)
+    textures: wp.array(dtype=Texture)
+    texels: wp.array(dtype=wp.uint32)  # RGBA8, red in the low byte
+    srgb_to_linear: wp.array(dtype=wp.float32)  # [256]
+    environment: Environment
+    emitters: Emitters
+    center: wp.vec3  # of the bounds
+    radius: wp.float32  # half the diagonal of the bounds

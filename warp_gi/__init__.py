@@ -1,0 +1,60 @@
+"""Precomputed and temporally reused global illumination in NVIDIA Warp kernels.
+
+Names load on first use, so that ``import warp_gi`` is fast and compiles nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+__version__ = "0.1.0"
+
+# public name -> module that defines it
+_PUBLIC = {
+    "GiError": "warp_gi.errors",
+    "SceneError": "warp_gi.errors",
+    "OptionError": "warp_gi.errors",
+    "BakeError": "warp_gi.errors",
+    "TriangleBvh": "warp_gi.bvh",
+    "Hits": "warp_gi.bvh",
+    "Scene": "warp_gi.scene.scene",
+    "Mesh": "warp_gi.scene.model",
+    "Material": "warp_gi.scene.model",
+    "Texture": "warp_gi.scene.model",
+    "Node": "warp_gi.scene.model",
+    "Keyframe": "warp_gi.scene.model",
+    "PunctualLight": "warp_gi.scene.model",
+    "load_scene": "warp_gi.scene.loading",
+    "Environment": "warp_gi.scene.environment",
+    "SunSky": "warp_gi.scene.environment",
+    "builtin_scene": "warp_gi.scene.builtin",
+    "Camera": "warp_gi.camera",
+    "CameraPath": "warp_gi.camera",
+    "Pipeline": "warp_gi.pipeline",
+    "Estimator": "warp_gi.pipeline",
+    "TracedEnvironment": "warp_gi.techniques.baselines",
+    "UniformLights": "warp_gi.techniques.baselines",
+    "PowerLights": "warp_gi.techniques.baselines",
+    "BsdfPaths": "warp_gi.techniques.baselines",
+    "FrameScheduler": "warp_gi.scheduler",
+    "Frame": "warp_gi.scheduler",
+    "render": "warp_gi.scheduler",
+    "write_frame": "warp_gi.sequence",
+    "set_threads": "warp_gi.launch",
+}
+_MODULES = ("metrics",)
+
+__all__ = sorted([*_PUBLIC, *_MODULES])
+
+
+def __getattr__(name: str) -> Any:
+    if name in _PUBLIC:
+        return getattr(importlib.import_module(_PUBLIC[name]), name)
+    if name in _MODULES:
+        return importlib.import_module(f"warp_gi.{name}")
+    raise AttributeError(f"module 'warp_gi' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

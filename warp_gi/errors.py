@@ -1,0 +1,30 @@
+"""Errors that a user can mend: one clear line, exit code 2 from the command line."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class GiError(ValueError):
+    """Base of every error that says what was expected, what came and what to do."""
+
+
+class SceneError(GiError):
+    """A scene, image, environment or camera file cannot be used."""
+
+
+class OptionError(GiError):
+    """A setting or option is unknown or out of range."""
+
+
+class BakeError(GiError):
+    """A saved bake or state is damaged, or belongs to something else."""
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str]) -> OptionError:
+    """Return an error for an unknown ``name`` that lists the known ones and the nearest match."""
+    known = sorted(known)
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    return OptionError(f"unknown {kind} {name!r}{hint} (known: {', '.join(known)})")

@@ -1,0 +1,158 @@
+"""The only caller of ``wp.launch``: checks arguments, slices CPU launches over threads, times compiles.
+
+Every kernel takes ``first: wp.int32`` as its first argument and owns the item
+``first + wp.tid()``. On the CPU a launch becomes slices that a pool of threads
+works off (a Warp CPU launch is one thread and releases the GIL); on CUDA it is
+one launch with ``first = 0``. No kernel uses atomics on the CPU, so the result
+does not depend on the slices.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import warp as wp
+
+from warp_gi.errors import OptionError
+
+SLICES_PER_THREAD = 16  # enough to balance uneven work, few enough that 30 us a launch vanish
+SMALLEST_SLICE = 256  # items
+CUDA_BLOCK = 256  # threads
+
+_pool: ThreadPoolExecutor | None = None
+_pool_size = 0
+_lock = threading.Lock()
+_threads: int | None = None
+compile_seconds = 0.0
+"""Wall seconds this process has spent compiling or loading kernel modules."""
+
+
+def thread_count() -> int:
+    """Return how many threads CPU launches use: ``set_threads``, else WARP_GI_THREADS, else every core allowed."""
+    if _threads is not None:
+        return _threads
+    text = os.environ.get("WARP_GI_THREADS")
+    if text:
+        return _checked_threads(text)
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def set_threads(count: int | None) -> None:
+    """Set how many threads CPU launches use; None goes back to the default.
+
+    Raises OptionError unless ``count`` is a whole number of at least 1.
+    """
+    global _threads
+    _threads = None if count is None else _checked_threads(count)
+
+
+def _checked_threads(value: object) -> int:
+    try:
+        count = int(value)  # type: ignore[call-overload]
+    except (TypeError, ValueError):
+        count = 0
+    if count < 1:
+        raise OptionError(f"thread count must be a whole number of at least 1, got {value!r}")
+    return count
+
+
+def get_device(name: str | None) -> wp.Device:
+    """Return the Warp device of that name ("cpu", "cuda", "cuda:1"); raises OptionError if it is not there."""
+    try:
+        return wp.get_device(name or "cpu")
+    except (RuntimeError, ValueError) as error:
+        known = ", ".join(device.alias for device in wp.get_devices())
+        raise OptionError(f"device {name!r} is not available ({error}); use one of: {known}") from error
+
+
+def load(kernel: wp.Kernel, device: wp.Device) -> None:
+    """Compile or load the kernel's module now, and add the time to ``compile_seconds``."""
+    global compile_seconds
+    started = time.perf_counter()
+    with _lock:
+        kernel.module.load(device, 1 if device.is_cpu else CUDA_BLOCK)
+    compile_seconds += time.perf_counter() - started
+
+
+def launch(
+    kernel: wp.Kernel, count: int, inputs: Sequence[object], device: wp.Device, smallest_slice: int = SMALLEST_SLICE
+) -> None:
+    """Run ``kernel`` over items 0 to ``count`` - 1.
+
+    ``inputs`` are the arguments after ``first``. Raises TypeError when an argument's
+    type, dtype, rank or device is not what the kernel declares.
+    """
+    _check(kernel, inputs, device)
+    if count <= 0:
+        return
+    load(kernel, device)
+    if device.is_cuda:
+        wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device, record_tape=False)
+        return
+    threads = thread_count()
+    slice_count = min(threads * SLICES_PER_THREAD if threads > 1 else 1, -(-count // smallest_slice))
+    bounds = [count * i // slice_count for i in range(slice_count + 1)]
+
+    def run(begin: int, end: int) -> None:
+        wp.launch(kernel, dim=end - begin, inputs=[begin, *inputs], device=device, record_tape=False)
+
+    if slice_count == 1:
+        run(0, count)
+        return
+    list(_thread_pool(threads).map(run, bounds[:-1], bounds[1:]))
+
+
+def _thread_pool(size: int) -> ThreadPoolExecutor:
+    global _pool, _pool_size
+    with _lock:
+        if _pool is None or _pool_size != size:
+            if _pool is not None:
+                _pool.shutdown(wait=True)
+            _pool, _pool_size = ThreadPoolExecutor(size, thread_name_prefix="warp_gi"), size
+        return _pool
+
+
+def _check(kernel: wp.Kernel, inputs: Sequence[object], device: wp.Device) -> None:
+    arguments = kernel.adj.args
+    if arguments[0].label != "first":
+        raise TypeError(f"kernel {kernel.key}: the first argument must be `first: wp.int32`")
+    if len(inputs) != len(arguments) - 1:
+        raise TypeError(f"kernel {kernel.key} takes {len(arguments) - 1} inputs after `first`, got {len(inputs)}")
+    for argument, value in zip(arguments[1:], inputs, strict=True):
+        problem = _mismatch(argument.type, value, device)
+        if problem:
+            raise TypeError(f"kernel {kernel.key}, argument {argument.label}: {problem}")
+
+
+def _mismatch(expected: object, value: object, device: wp.Device) -> str | None:
+    if isinstance(expected, wp.array):
+        if value is None:
+            return None
+        if not isinstance(value, wp.array):
+            return f"expected a wp.array, got {type(value).__name__}"
+        if value.dtype is not expected.dtype and getattr(value.dtype, "cls", 0) is not getattr(expected.dtype, "cls", 1):
+            return f"expected dtype {expected.dtype}, got {value.dtype}"
+        if value.ndim != expected.ndim:
+            return f"expected {expected.ndim} dimensions, got {value.ndim}"
+        if value.device != device:
+            return f"expected an array on {device}, got one on {value.device}"
+        return None
+    if hasattr(expected, "vars") and hasattr(expected, "cls"):  # a wp.struct
+        struct = getattr(value, "_cls", None)
+        if struct is not expected:
+            return f"expected struct {expected.key}, got {getattr(struct, 'key', type(value).__name__)}"
+        for name, variable in expected.vars.items():
+            problem = _mismatch(variable.type, getattr(value, name), device)
+            if problem:
+                return f"field {name}: {problem}"
+        return None
+    if isinstance(value, np.ndarray | wp.array):
+        return f"expected {expected}, got an array"
+    return None

@@ -1,0 +1,110 @@
+"""The parts a scene is made of: plain host-side data, validated when a Scene is built from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+Color = tuple[float, float, float]
+
+
+@dataclass(eq=False)
+class Texture:
+    """An 8-bit image."""
+
+    name: str
+    pixels: np.ndarray
+    """uint8 [height, width, 4], RGBA, row 0 at the top as in files."""
+    srgb: bool = True
+    """Whether red, green and blue are sRGB-coded (colours) or linear (normals, roughness)."""
+    wrap: tuple[str, str] = ("repeat", "repeat")
+    """Wrap modes in u and v: "repeat", "clamp" or "mirror"."""
+
+
+@dataclass(eq=False)
+class Material:
+    """A glTF 2.0 metallic-roughness material."""
+
+    name: str = "material"
+    base_color: Color = (0.8, 0.8, 0.8)
+    """Linear Rec. 709 reflectance, multiplied with ``base_color_texture``."""
+    alpha: float = 1.0
+    metallic: float = 0.0
+    roughness: float = 1.0
+    """Perceptual roughness; the GGX alpha is its square."""
+    specular: float = 1.0
+    """KHR_materials_specular factor: 1 is the usual F0 of 0.04, 0 is pure Lambert."""
+    emission: Color = (0.0, 0.0, 0.0)
+    """Emitted radiance, W/(m^2 sr), multiplied with ``emission_texture``."""
+    base_color_texture: Texture | None = None
+    metallic_roughness_texture: Texture | None = None
+    """Green is roughness, blue is metallic; linear."""
+    normal_texture: Texture | None = None
+    emission_texture: Texture | None = None
+    normal_scale: float = 1.0
+    alpha_cutoff: float | None = None
+    """A hit where alpha < cutoff is passed through; None is opaque."""
+    double_sided: bool = True
+    """Whether it emits on both sides. Every surface reflects and blocks light on both."""
+
+
+@dataclass(eq=False)
+class Mesh:
+    """Triangles of one material, in the space of their object."""
+
+    points: np.ndarray
+    """float32 [vertex, 3], metres."""
+    indices: np.ndarray
+    """int32 [triangle, 3], counter-clockwise seen from the front."""
+    material: Material = field(default_factory=Material)
+    normals: np.ndarray | None = None
+    """float32 [vertex, 3] unit shading normals; None is flat shading."""
+    uvs: np.ndarray | None = None
+    """float32 [vertex, 2], v up; None is all zero."""
+    name: str = "mesh"
+
+
+@dataclass(eq=False)
+class PunctualLight:
+    """A light without size, as KHR_lights_punctual defines it."""
+
+    kind: str
+    """"point", "spot" or "directional"."""
+    intensity: Color
+    """W/sr a channel (point, spot) or W/m^2 perpendicular to the light (directional)."""
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    direction: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    """The way the light shines."""
+    inner_cone: float = 0.0
+    """Half angle in radians where a spot begins to fall off."""
+    outer_cone: float = 0.7853981633974483
+    range: float | None = None
+    """Distance in metres at which the light ends; None is no limit."""
+    name: str = "light"
+
+
+@dataclass(eq=False)
+class Node:
+    """A named placement of meshes; the objects of a scene. Parents come before children."""
+
+    name: str
+    meshes: list[Mesh] = field(default_factory=list)
+    parent_from_node: np.ndarray = field(default_factory=lambda: np.eye(4))
+    """float64 [4, 4] at rest, acting on column vectors."""
+    parent: int | None = None
+    """Index of the parent in Scene.nodes."""
+    keyframes: list[Keyframe] | None = None
+    """Animation; replaces ``parent_from_node``."""
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A rigid pose with scale at a time; linear between keys (rotation: spherical), held outside them."""
+
+    time: float
+    """Seconds."""
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    """Unit quaternion x, y, z, w."""
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
