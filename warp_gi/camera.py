@@ -1,0 +1,264 @@
+"""Pinhole cameras and camera paths."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from warp_gi.errors import OptionError, SceneError
+
+Vec3 = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera. It looks along -z of its own space, x is right and y up in the picture.
+
+    Raises OptionError for a field of view outside (0, 180) degrees, an empty
+    resolution, or a matrix that is singular or not finite.
+    """
+
+    world_from_camera: np.ndarray
+    """float64 [4, 4], acting on column vectors; its axes are made orthonormal."""
+    hfov: float = 65.0
+    """Horizontal field of view, degrees."""
+    resolution: tuple[int, int] = (960, 540)
+    """Width and height in pixels."""
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        matrix = np.array(self.world_from_camera, dtype=np.float64)
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+            raise OptionError(f"camera {self.name!r}: world_from_camera must be a finite 4x4 matrix, got {matrix}")
+        if abs(np.linalg.det(matrix[:3, :3])) < 1e-12:
+            raise OptionError(f"camera {self.name!r}: world_from_camera is singular; give three independent axes")
+        z = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
+        y = matrix[:3, 1] - z * (matrix[:3, 1] @ z)
+        y /= np.linalg.norm(y)
+        matrix[:3, :3] = np.stack([np.cross(y, z), y, z], axis=1)
+        object.__setattr__(self, "world_from_camera", matrix)
+        if not 0.0 < self.hfov < 180.0:
+            raise OptionError(f"camera {self.name!r}: hfov must be between 0 and 180 degrees, got {self.hfov}")
+        try:
+            width, height = (int(size) for size in self.resolution)
+        except (TypeError, ValueError) as error:
+            raise OptionError(f"resolution must be (width, height), got {self.resolution!r}") from error
+        if width < 1 or height < 1:
+            raise OptionError(f"resolution must be at least 1x1, got {width}x{height}")
+        object.__setattr__(self, "resolution", (width, height))
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: Sequence[float],
+        target: Sequence[float],
+        up: Sequence[float] = (0.0, 1.0, 0.0),
+        hfov: float = 65.0,
+        resolution: tuple[int, int] = (960, 540),
+        name: str = "",
+    ) -> Camera:
+        """Return a camera at ``eye`` [m] that looks at ``target`` [m].
+
+        Raises OptionError if eye and target coincide or ``up`` is along the view.
+        """
+        return cls(_look_at_matrix(eye, target, up), hfov, resolution, name)
+
+    def at_resolution(self, width: int, height: int) -> Camera:
+        """Return the same camera with another resolution."""
+        return replace(self, resolution=(width, height))
+
+    @property
+    def position(self) -> np.ndarray:
+        """The eye, float64 [3], metres."""
+        return self.world_from_camera[:3, 3]
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Return pixel coordinates float64 [n, 2] of world ``points`` [n, 3]; (0, 0) is the top left corner."""
+        local = (np.asarray(points, dtype=np.float64) - self.position) @ self.world_from_camera[:3, :3]
+        width, height = self.resolution
+        scale = 0.5 * width / math.tan(math.radians(self.hfov) / 2)
+        xy = local[:, :2] / -local[:, 2:] * [scale, -scale]
+        return xy + [0.5 * width, 0.5 * height]
+
+
+def _look_at_matrix(eye: Sequence[float], target: Sequence[float], up: Sequence[float]) -> np.ndarray:
+    eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
+    if eye.shape != (3,) or target.shape != (3,) or up.shape != (3,):
+        raise OptionError("eye, target and up must be three numbers each")
+    back = eye - target
+    right = np.cross(up, back)
+    if not np.linalg.norm(back) > 0 or not np.linalg.norm(right) > 1e-9 * np.linalg.norm(back) * np.linalg.norm(up):
+        raise OptionError(f"camera at {eye.tolist()} cannot look at {target.tolist()} with up {up.tolist()}")
+    back /= np.linalg.norm(back)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+    matrix[:3, 3] = eye
+    return matrix
+
+
+@dataclass(frozen=True)
+class CameraKey:
+    """A camera pose at a time."""
+
+    time: float
+    """Seconds."""
+    eye: Vec3
+    target: Vec3
+    up: Vec3 = (0.0, 1.0, 0.0)
+    hfov: float = 65.0
+    """Degrees."""
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Keyframes in time; eye, target, up and field of view follow cubic Hermite curves through the keys.
+
+    Raises OptionError without keys, or with times that do not rise.
+    """
+
+    keys: tuple[CameraKey, ...]
+    fps: float = 24.0
+    """Frames a second: frame i is at time ``i / fps``."""
+    resolution: tuple[int, int] = (960, 540)
+    name: str = field(default="", compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "keys", tuple(self.keys))
+        if not self.keys:
+            raise OptionError("a camera path needs at least one keyframe")
+        if any(a.time >= b.time for a, b in zip(self.keys, self.keys[1:], strict=False)):
+            raise OptionError("the times of a camera path's keyframes must rise")
+        if not self.fps > 0:
+            raise OptionError(f"fps must be above 0, got {self.fps}")
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames from time 0 to the last key, both included."""
+        return int(math.floor(self.keys[-1].time * self.fps + 1e-6)) + 1
+
+    def camera(self, frame: int) -> Camera:
+        """Return the camera of a frame."""
+        return self.camera_at(frame / self.fps)
+
+    def camera_at(self, time: float) -> Camera:
+        """Return the camera at a time in seconds, held before the first and after the last key."""
+        rows = np.array([[*k.eye, *k.target, *k.up, k.hfov] for k in self.keys], dtype=np.float64)
+        pose = _hermite(np.array([k.time for k in self.keys]), rows, time)
+        return Camera.look_at(pose[0:3], pose[3:6], pose[6:9], float(pose[9]), self.resolution, self.name)
+
+    def at_resolution(self, width: int, height: int) -> CameraPath:
+        """Return the same path with another resolution."""
+        return replace(self, resolution=(width, height))
+
+    @classmethod
+    def still(cls, camera: Camera) -> CameraPath:
+        """Return a path that stays at ``camera``."""
+        return cls.from_cameras([camera])
+
+    @classmethod
+    def from_cameras(cls, cameras: Iterable[Camera], times: Iterable[float] | None = None, fps: float = 24.0) -> CameraPath:
+        """Return a path through ``cameras``, at ``times`` in seconds or one a frame."""
+        cameras = list(cameras)
+        times = [i / fps for i in range(len(cameras))] if times is None else list(times)
+        keys = []
+        for camera, time in zip(cameras, times, strict=True):
+            matrix = camera.world_from_camera
+            target = matrix[:3, 3] - matrix[:3, 2]
+            keys.append(CameraKey(time, tuple(matrix[:3, 3]), tuple(target), tuple(matrix[:3, 1]), camera.hfov))
+        return cls(tuple(keys), fps, cameras[0].resolution if cameras else (960, 540))
+
+    @classmethod
+    def orbit(
+        cls,
+        center: Sequence[float],
+        radius: float,
+        height: float = 0.0,
+        seconds: float = 2.0,
+        turns: float = 1.0,
+        hfov: float = 65.0,
+        resolution: tuple[int, int] = (960, 540),
+        fps: float = 24.0,
+    ) -> CameraPath:
+        """Return a path that circles ``center`` at ``radius`` and ``height`` above it [m], looking at it."""
+        count = max(2, int(math.ceil(abs(turns) * 24)) + 1)
+        cx, cy, cz = center
+        keys = []
+        for i in range(count):
+            angle = 2 * math.pi * turns * i / (count - 1)
+            eye = (cx + radius * math.sin(angle), cy + height, cz + radius * math.cos(angle))
+            keys.append(CameraKey(seconds * i / (count - 1), eye, (cx, cy, cz), hfov=hfov))
+        return cls(tuple(keys), fps, resolution)
+
+    @classmethod
+    def load(cls, path: str | Path) -> CameraPath:
+        """Read a path from JSON, as ``save`` writes it.
+
+        ``{"fps": 24, "resolution": [960, 540], "keyframes": [{"time": 0, "eye": [x, y, z],
+        "target": [x, y, z], "up": [0, 1, 0], "hfov": 65}, ...]}``; up, hfov, fps and resolution may be left out.
+        Raises SceneError when the file is missing or not such a path.
+        """
+        try:
+            document = json.loads(Path(path).read_text(encoding="utf-8"))
+        except OSError as error:
+            raise SceneError(f"camera path {path}: {error.strerror}; give a JSON file with keyframes") from error
+        except ValueError as error:
+            raise SceneError(f"camera path {path}: not JSON ({error})") from error
+        try:
+            keys = [
+                CameraKey(
+                    float(key.get("time", 0.0)),
+                    _three(key["eye"]),
+                    _three(key["target"]),
+                    _three(key.get("up", (0, 1, 0))),
+                    float(key.get("hfov", 65.0)),
+                )
+                for key in document["keyframes"]
+            ]
+            fps = float(document.get("fps", 24.0))
+            width, height = (int(size) for size in document.get("resolution", (960, 540)))
+            result = cls(tuple(keys), fps, (width, height), name=Path(path).stem)
+            result.camera_at(0.0)
+        except KeyError as error:
+            raise SceneError(f"camera path {path}: {error} is missing from the path or from a keyframe") from error
+        except (TypeError, ValueError, AttributeError) as error:
+            raise SceneError(f"camera path {path}: {error}") from error
+        return result
+
+    def save(self, path: str | Path) -> None:
+        """Write the path as JSON."""
+        keys = [
+            {"time": k.time, "eye": list(k.eye), "target": list(k.target), "up": list(k.up), "hfov": k.hfov}
+            for k in self.keys
+        ]
+        document = {"fps": self.fps, "resolution": list(self.resolution), "keyframes": keys}
+        Path(path).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+
+
+def _three(values: Sequence[float]) -> Vec3:
+    x, y, z = (float(v) for v in values)
+    return x, y, z
+
+
+def _hermite(times: np.ndarray, rows: np.ndarray, time: float) -> np.ndarray:
+    """Cubic Hermite interpolation with finite-difference slopes (non-uniform Catmull-Rom)."""
+    if len(times) == 1 or time <= times[0]:
+        return rows[0]
+    if time >= times[-1]:
+        return rows[-1]
+    i = int(np.searchsorted(times, time, side="right")) - 1
+    steps = np.diff(rows, axis=0) / np.diff(times)[:, None]
+    slopes = np.concatenate([steps[:1], 0.5 * (steps[1:] + steps[:-1]), steps[-1:]])
+    h = times[i + 1] - times[i]
+    s = (time - times[i]) / h
+    return (
+        (2 * s**3 - 3 * s**2 + 1) * rows[i]
+        + (s**3 - 2 * s**2 + s) * h * slopes[i]
+        + (3 * s**2 - 2 * s**3) * rows[i + 1]
+        + (s**3 - s**2) * h * slopes[i + 1]
+    )
