@@ -1,0 +1,270 @@
+"""The light from infinitely far away: a latitude-longitude map, a constant colour, or an analytic sky.
+
+Orientation: a direction (x, y, z) in the sky's own space (y up) lies at
+``u = fract(atan2(x, -z) / 2 pi)``, ``v = acos(y) / pi``. So the left edge of a map looks along -z, a quarter
+of the way right is +x, the middle +z, three quarters -x; the top row is the zenith, the bottom row the nadir.
+Texel (row i, column j) is a node at ``u = (j + 0.5) / width``, ``v = i / (height - 1)``; between nodes radiance
+is bilinear. This is Mitsuba 3's ``envmap`` with an identity ``to_world``.
+
+``rotation`` is in degrees about +y by the right-hand rule: a positive one turns the sky counter-clockwise seen
+from above (what was along -z moves towards -x). It is Mitsuba's ``to_world = rotate([0, 1, 0], rotation)``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import warnings
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_gi.alias import AliasTable
+from warp_gi.errors import SceneError
+from warp_gi.kernels import types
+from warp_gi.launch import get_device
+from warp_gi.scene.model import Color
+from warp_gi.scene.sky import SunSky, node_solid_angles
+
+__all__ = ["Environment", "SunSky", "as_environment"]
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+LARGEST_HEIGHT = 4096  # texel indices and the random number that picks one must fit float32
+
+
+class _Map:
+    """Pixels and what is derived from them once: shared by all rotations and scales of one map."""
+
+    def __init__(self, pixels: np.ndarray) -> None:
+        self.pixels = pixels
+        self.arrays: dict[str, tuple[wp.array, ...]] = {}
+
+    @cached_property
+    def digest(self) -> bytes:
+        return hashlib.sha256(np.int64(self.pixels.shape).tobytes() + self.pixels.tobytes()).digest()
+
+    @cached_property
+    def mean(self) -> np.ndarray:
+        """float64 [3]: the radiance averaged over the sphere, exact for the bilinear map."""
+        height, width = self.pixels.shape[:2]
+        return self.pixels.sum(1, dtype=np.float64).T @ node_solid_angles(height, width) / (4 * math.pi)
+
+    def on(self, device: wp.Device) -> tuple[wp.array, ...]:
+        """Return texels, alias probability, alias index and pdf on the device."""
+        if device.alias not in self.arrays:
+            table = AliasTable.build(_cell_weights(self.pixels))
+            texels = wp.array(self.pixels.reshape(-1, 3), dtype=wp.vec3, device=device)
+            rest = (
+                wp.array(table.probability, dtype=wp.float32, device=device),
+                wp.array(table.index, dtype=wp.int32, device=device),
+                wp.array(table.pdf, dtype=wp.float32, device=device),
+            )
+            self.arrays[device.alias] = (texels, *rest)
+        return self.arrays[device.alias]
+
+
+def _cell_weights(pixels: np.ndarray) -> np.ndarray:
+    """Return float64 [height, width]: mean luminance of each cell around a node times the cell's solid angle.
+
+    The mean is that of the bilinear interpolant, so a cell's weight is positive wherever its radiance is.
+    """
+    height, width = pixels.shape[:2]
+    value = pixels.astype(np.float64) @ LUMINANCE
+    value = 0.75 * value + 0.125 * (np.roll(value, 1, 1) + np.roll(value, -1, 1))
+    mean = 0.75 * value
+    mean[1:-1] += 0.125 * (value[:-2] + value[2:])
+    mean[0] += 0.25 * value[1]
+    mean[-1] += 0.25 * value[-2]
+    edges = (np.clip(np.arange(height + 1) - 0.5, 0, height - 1)) * (math.pi / (height - 1))
+    half_step = 0.5 * np.diff(edges)
+    area = 4 * math.pi / width * np.sin(0.5 * (edges[1:] + edges[:-1])) * np.sin(half_step)
+    return mean * area[:, None]
+
+
+@dataclass(eq=False)
+class Environment:
+    """A sky: a latitude-longitude map, a constant colour, or (neither given) black."""
+
+    pixels: np.ndarray | None = None
+    """float32 [height, width, 3] radiance in W/(m^2 sr), width = 2 height, row 0 up."""
+    color: Color | None = None
+    """Constant radiance in W/(m^2 sr)."""
+    rotation: float = 0.0
+    """Degrees about +y; positive turns the sky counter-clockwise seen from above."""
+    scale: float = 1.0
+    """Multiplies the radiance."""
+    name: str = "environment"
+    """What error messages call it."""
+    _map: _Map | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.pixels is not None and self.color is not None:
+            raise SceneError("environment: give pixels or a color, not both")
+        if not math.isfinite(self.rotation):
+            raise SceneError(f"environment rotation must be a finite number of degrees, got {self.rotation}")
+        if not (math.isfinite(self.scale) and self.scale >= 0):
+            raise SceneError(f"environment scale must be finite and not negative, got {self.scale}")
+        if self.color is not None:
+            self.color = _checked_color(self.color)
+        if self.pixels is not None and self._map is None:
+            self.pixels = _checked_pixels(self.pixels, self.name)
+            self._map = _Map(self.pixels)
+
+    @staticmethod
+    def load(path: str | Path, rotation: float = 0.0, scale: float = 1.0) -> Environment:
+        """Read a 2:1 latitude-longitude image (EXR, HDR or what else OpenImageIO reads; integers as sRGB).
+
+        Raises SceneError if the file is missing or damaged, not 2:1, or has NaN or infinite pixels.
+        Negative pixels, which resampling filters leave behind, are set to 0 with a warning.
+        """
+        pixels = _read_image(Path(path))
+        name = f"environment {str(path)!r}"
+        negative = pixels < 0
+        if negative.any():
+            count = int(negative.any(-1).sum())
+            warnings.warn(f"{name}: {count} pixels are negative (lowest {pixels.min():.3g}); set to 0", stacklevel=2)
+            pixels = np.where(negative, np.float32(0), pixels)
+        return Environment(pixels=pixels, rotation=rotation, scale=scale, name=name)
+
+    @staticmethod
+    def constant(rgb: Color | float) -> Environment:
+        """Return a sky of one radiance, RGB or grey, in W/(m^2 sr)."""
+        return Environment(color=_checked_color(rgb))
+
+    @property
+    def is_black(self) -> bool:
+        """Whether it emits nothing."""
+        return not self.mean_radiance.any()
+
+    @property
+    def mean_radiance(self) -> np.ndarray:
+        """float64 [3]: the radiance averaged over the sphere, W/(m^2 sr)."""
+        if self._map is not None:
+            return self._map.mean * self.scale
+        return np.array(self.color or (0.0, 0.0, 0.0)) * self.scale
+
+    @property
+    def content_hash(self) -> str:
+        """Hexadecimal SHA-256 of all that determines the radiance."""
+        digest = hashlib.sha256(b"environment")
+        digest.update(np.array([math.fmod(self.rotation, 360.0), self.scale]).tobytes())
+        digest.update(self._map.digest if self._map else np.array(self.color or (0.0, 0.0, 0.0)).tobytes())
+        return digest.hexdigest()
+
+    def rotated(self, degrees: float) -> Environment:
+        """Return this sky turned about +y by ``degrees``, counter-clockwise seen from above; pixels are shared."""
+        rotation = self.rotation + degrees
+        return Environment(self.pixels, self.color, rotation, self.scale, self.name, self._map)
+
+    @property
+    def world_from_environment(self) -> np.ndarray:
+        """float64 [3, 3] rotation of the sky's own directions into world space."""
+        angle = math.radians(self.rotation)
+        c, s = math.cos(angle), math.sin(angle)
+        return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+    def data(self, device: str | wp.Device | None = None) -> Any:
+        """Return the ``kernels.types.Environment`` struct on the device; its arrays are made once a device."""
+        target = device if isinstance(device, wp.Device) else get_device(device)
+        result = types.Environment()
+        result.environment_from_world = wp.mat33(*self.world_from_environment.T.ravel())
+        if self.is_black:
+            result.kind = types.ENVIRONMENT_NONE
+        elif self._map is None:
+            result.kind = types.ENVIRONMENT_CONSTANT
+            result.radiance = wp.vec3(*self.mean_radiance)
+        else:
+            result.kind = types.ENVIRONMENT_MAP
+            result.radiance = wp.vec3(self.scale, self.scale, self.scale)
+            result.height, result.width = self._map.pixels.shape[:2]
+            arrays = self._map.on(target)
+            result.texels, result.alias_probability, result.alias_index, result.pdf = arrays
+        return result
+
+
+def as_environment(value: object) -> Environment:
+    """Return an Environment from a path, an RGB triple, a grey number, a SunSky, an Environment, or None (black).
+
+    Raises SceneError for anything else, and what ``Environment.load`` raises.
+    """
+    if value is None:
+        return Environment()
+    if isinstance(value, Environment):
+        return value
+    if isinstance(value, SunSky):
+        return Environment(pixels=value.pixels(), name="sun and sky")
+    if isinstance(value, str | Path):
+        return Environment.load(value)
+    return Environment.constant(value)  # type: ignore[arg-type]
+
+
+def _checked_color(rgb: object) -> Color:
+    try:
+        color = np.array(rgb, np.float64)
+        if color.ndim == 0:
+            color = np.repeat(color, 3)
+    except (TypeError, ValueError):
+        color = np.zeros(0)
+    if color.shape != (3,) or not np.isfinite(color).all() or (color < 0).any():
+        raise SceneError(
+            f"environment must be a file, an RGB triple of finite numbers of at least 0, or SunSky(...), got {rgb!r}"
+        )
+    return tuple(color.tolist())
+
+
+def _checked_pixels(pixels: object, name: str) -> np.ndarray:
+    pixels = np.ascontiguousarray(np.asarray(pixels, np.float32))
+    if pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise SceneError(f"{name}: expected pixels of shape [height, 2 * height, 3], got {list(pixels.shape)}")
+    height, width = pixels.shape[:2]
+    if width != 2 * height or height < 2:
+        raise SceneError(
+            f"{name}: a latitude-longitude map is twice as wide as high and at least 4x2, got {width}x{height};"
+            " convert or crop it"
+        )
+    if height > LARGEST_HEIGHT:
+        raise SceneError(f"{name}: at most {2 * LARGEST_HEIGHT}x{LARGEST_HEIGHT} is supported, got {width}x{height}")
+    if not np.isfinite(pixels).all():
+        bad = int((~np.isfinite(pixels).all(-1)).sum())
+        raise SceneError(f"{name}: {bad} pixels are NaN or infinite; repair the image")
+    if pixels.min() < 0:
+        raise SceneError(f"{name}: radiance must not be negative, lowest is {pixels.min():.3g}")
+    return pixels
+
+
+def _read_image(path: Path) -> np.ndarray:
+    import OpenImageIO as oiio
+
+    name = f"environment {str(path)!r}"
+    if not path.is_file():
+        raise SceneError(f"{name}: no such file; give a latitude-longitude EXR or HDR image")
+    if path.stat().st_size == 0:
+        raise SceneError(f"{name}: the file is empty")
+    image = oiio.ImageInput.open(str(path))
+    if image is None:
+        raise SceneError(f"{name}: not an image that can be read ({_one_line(oiio.geterror())})")
+    try:
+        spec = image.spec()
+        if spec.width < 1 or spec.height < 1:
+            raise SceneError(f"{name}: the image has no pixels ({spec.width}x{spec.height})")
+        pixels = image.read_image(0, 0, 0, spec.nchannels, oiio.FLOAT)
+        if pixels is None or image.has_error:
+            raise SceneError(f"{name}: the image is damaged or cut short ({_one_line(image.geterror())})")
+    finally:
+        image.close()
+    names = [channel.upper() for channel in spec.channelnames]
+    colors = [names.index(c) for c in "RGB"] if {"R", "G", "B"} <= set(names) else [0, 1, 2]
+    if spec.nchannels < 3:
+        colors = [0, 0, 0]
+    pixels = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)[..., colors]
+    if not spec.format.is_floating_point:
+        pixels = np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    return np.ascontiguousarray(pixels)
+
+
+def _one_line(message: str) -> str:
+    return " ".join(message.split()) or "no reason given"
