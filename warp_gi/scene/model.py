@@ -82,6 +82,8 @@ class PunctualLight:
     range: float | None = None
     """Distance in metres at which the light ends; None is no limit."""
     name: str = "light"
+    node: int | None = None
+    """Index in Scene.nodes of the node that carries the light, and in whose space it is given; None is the world."""
 
 
 @dataclass(eq=False)

@@ -1,0 +1,130 @@
+"""The lights of a scene: emissive triangles first, then punctual lights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from warp_gi.errors import SceneError
+from warp_gi.kernels import types
+from warp_gi.scene.geometry import FlatGeometry
+from warp_gi.scene.model import Material, Node, PunctualLight, Texture
+from warp_gi.scene.textures import LUMINANCE, linear_rgb
+
+LIGHT_KINDS = {
+    "point": types.EMITTER_POINT,
+    "spot": types.EMITTER_SPOT,
+    "directional": types.EMITTER_DIRECTIONAL,
+}
+
+SMALLEST_AREA = 1e-18
+"""Square metres; a smaller triangle cannot be sampled in float32 and is no emitter."""
+
+
+def check_light(light: PunctualLight, nodes: Sequence[Node]) -> None:
+    """Raise SceneError where a field of ``light`` is unknown, out of range or not finite."""
+    name = f"light {light.name!r}"
+    if light.kind not in LIGHT_KINDS:
+        raise SceneError(f"{name}: unknown kind {light.kind!r} (known: {', '.join(LIGHT_KINDS)})")
+    for label in ("intensity", "position", "direction"):
+        values = np.asarray(getattr(light, label), np.float64)
+        if values.shape != (3,) or not np.isfinite(values).all():
+            raise SceneError(f"{name}: {label} must be 3 finite numbers, got {getattr(light, label)!r}")
+    if min(light.intensity) < 0.0:
+        raise SceneError(f"{name}: intensity must not be negative, got {light.intensity}")
+    if light.kind != "point" and not np.linalg.norm(light.direction) > 1e-12:
+        raise SceneError(f"{name}: direction must not be zero")
+    if light.kind == "spot" and not 0.0 <= light.inner_cone < light.outer_cone <= np.pi / 2 + 1e-6:
+        raise SceneError(
+            f"{name}: needs 0 <= inner_cone < outer_cone <= pi/2 radians, got {light.inner_cone} and {light.outer_cone}"
+        )
+    if light.range is not None and not light.range > 0.0:
+        raise SceneError(f"{name}: range must be above 0 m, or None for no limit, got {light.range}")
+    if light.node is not None and not 0 <= light.node < len(nodes):
+        raise SceneError(f"{name}: node must be from 0 to {len(nodes) - 1}, got {light.node}")
+
+
+def emissive_triangles(flat: FlatGeometry, materials: Sequence[Material]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the triangles that emit (int64 [count], rising) and their powers (float64 [count]).
+
+    Power is pi times area times the luminance of the mean emission under the
+    triangle, twice that if both sides emit. A triangle is left out if its area is
+    zero or its texture is black all over it.
+    """
+    shining = np.array([max(m.emission) > 0.0 for m in materials])
+    triangles = np.flatnonzero(shining[flat.materials])
+    corners = flat.points[flat.indices[triangles]]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    powers = np.pi * 0.5 * np.linalg.norm(cross.astype(np.float64), axis=1)
+    powers[powers < np.pi * SMALLEST_AREA] = 0.0
+    for index in np.flatnonzero(shining):
+        mine = flat.materials[triangles] == index
+        material = materials[index]
+        radiance = np.asarray(material.emission, np.float64)
+        if material.emission_texture is not None:
+            uvs = flat.uvs[flat.indices[triangles[mine]]]
+            radiance = radiance * mean_color(material.emission_texture, uvs.min(axis=1), uvs.max(axis=1))
+        powers[mine] *= radiance @ LUMINANCE * (2.0 if material.double_sided else 1.0)
+    kept = powers > 0.0
+    return triangles[kept], powers[kept]
+
+
+def mean_color(texture: Texture, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the mean linear colour of the texels that bilinear lookups in uv boxes can read, float64 [n, 3].
+
+    ``low`` and ``high`` are the corners of the boxes, [n, 2], v up. The mean is zero
+    only if all those texels are black.
+    """
+    image = linear_rgb(texture)[::-1].astype(np.float64)
+    boxes = []
+    for axis, size, wrap in ((1, image.shape[1], texture.wrap[0]), (0, image.shape[0], texture.wrap[1])):
+        begin = np.floor(low[:, 1 - axis].astype(np.float64) * size - 0.5) - 1.0
+        end = np.floor(high[:, 1 - axis].astype(np.float64) * size - 0.5) + 3.0
+        if wrap == "clamp":
+            begin, end = np.clip(begin, 0, size - 1), np.clip(end, 1, size)
+        else:
+            if wrap == "mirror":
+                image = np.concatenate([image, np.flip(image, axis)], axis)
+                size *= 2
+            image = np.concatenate([image, image], axis)
+            whole = end - begin >= size
+            begin, end = (
+                np.where(whole, 0, np.mod(begin, size)),
+                np.where(whole, size, np.mod(begin, size) + end - begin),
+            )
+        boxes.append((begin.astype(np.int64), end.astype(np.int64)))
+    (left, right), (bottom, top) = boxes
+    right, top = np.maximum(right, left + 1), np.maximum(top, bottom + 1)
+    sums = np.pad(image, ((1, 0), (1, 0), (0, 0))).cumsum(0).cumsum(1)
+    total = sums[top, right] - sums[bottom, right] - sums[top, left] + sums[bottom, left]
+    total[total < 1e-4] = 0.0  # rounding: the darkest code that is not black is 3e-4
+    return total / ((right - left) * (top - bottom))[:, None]
+
+
+def light_power(light: PunctualLight, radius: float) -> float:
+    """Return the power of a punctual light [W, luminance]; a directional one lights a disc of ``radius`` [m]."""
+    luminance = float(np.asarray(light.intensity, np.float64) @ LUMINANCE)
+    if light.kind == "point":
+        return 4.0 * np.pi * luminance
+    if light.kind == "spot":
+        return 2.0 * np.pi * (1.0 - 0.5 * (np.cos(light.inner_cone) + np.cos(light.outer_cone))) * luminance
+    return np.pi * radius * radius * luminance
+
+
+def emitter_table(triangles: np.ndarray, lights: Sequence[PunctualLight], world: Sequence[np.ndarray]) -> np.ndarray:
+    """Return all emitters as an array with the dtype of types.Emitter; ``world`` is world_from_node of every node."""
+    table = np.zeros(len(triangles) + len(lights), types.Emitter.numpy_dtype())
+    table["triangle"] = -1
+    table["kind"][: len(triangles)] = types.EMITTER_TRIANGLE
+    table["triangle"][: len(triangles)] = triangles
+    for row, light in zip(table[len(triangles) :], lights, strict=True):
+        matrix = np.eye(4) if light.node is None else world[light.node]
+        direction = matrix[:3, :3] @ np.asarray(light.direction, np.float64)
+        row["kind"] = LIGHT_KINDS[light.kind]
+        row["position"] = matrix[:3, :3] @ np.asarray(light.position, np.float64) + matrix[:3, 3]
+        row["direction"] = direction / max(np.linalg.norm(direction), 1e-30)
+        row["intensity"] = light.intensity
+        row["cos_inner"], row["cos_outer"] = np.cos(light.inner_cone), np.cos(light.outer_cone)
+        row["range"] = light.range or 0.0
+    return table

@@ -1,0 +1,149 @@
+"""All triangles of a scene in one set of world-space buffers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from warp_gi.errors import SceneError
+from warp_gi.scene.animation import check_keyframes
+from warp_gi.scene.model import Material, Mesh, Node
+from warp_gi.scene.textures import check_material
+
+
+@dataclass(eq=False)
+class FlatGeometry:
+    """Every node's meshes one after another, in world space."""
+
+    points: np.ndarray
+    """float32 [vertex, 3], metres."""
+    normals: np.ndarray
+    """float32 [vertex, 3], unit, or zero for flat shading."""
+    uvs: np.ndarray
+    """float32 [vertex, 2], v up."""
+    indices: np.ndarray
+    """int32 [triangle, 3]."""
+    materials: np.ndarray
+    """int32 [triangle], index in the scene's materials."""
+    objects: np.ndarray
+    """int32 [triangle], counts the nodes that have meshes."""
+    vertex_starts: list[int]
+    """First vertex of each node, and the number of vertices at the end."""
+
+
+def check_nodes(nodes: Sequence[Node]) -> None:
+    """Raise SceneError for a bad hierarchy, transform, keyframe or mesh, or if there is no triangle at all."""
+    for index, node in enumerate(nodes):
+        if node.parent is not None and not 0 <= node.parent < index:
+            raise SceneError(f"node {node.name!r}: parent must stand before it (0 to {index - 1}), got {node.parent}")
+        matrix = np.asarray(node.parent_from_node)
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+            raise SceneError(f"node {node.name!r}: parent_from_node must be a finite 4x4 matrix, got {matrix.tolist()}")
+        if node.keyframes is not None:
+            check_keyframes(node.keyframes, node.name)
+        for mesh in node.meshes:
+            check_mesh(mesh, f"mesh {mesh.name!r} of node {node.name!r}")
+    if not any(len(mesh.indices) for node in nodes for mesh in node.meshes):
+        raise SceneError("the scene has no triangles; give at least one mesh with faces")
+
+
+def check_mesh(mesh: Mesh, owner: str) -> None:
+    """Raise SceneError for wrong shapes, vertices that are not finite, and indices out of range."""
+    points, indices = np.asarray(mesh.points), np.asarray(mesh.indices)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise SceneError(f"{owner}: points must be [vertex, 3], got shape {list(points.shape)}")
+    if indices.ndim != 2 or indices.shape[1] != 3 or indices.dtype.kind not in "iu":
+        raise SceneError(f"{owner}: indices must be integers [triangle, 3], got {indices.dtype} {list(indices.shape)}")
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        bad = int(np.argmin(finite))
+        raise SceneError(
+            f"{owner}: {np.count_nonzero(~finite)} of {len(points)} vertices are not finite (the first is vertex {bad},"
+            f" {points[bad].tolist()}); mend or remove them"
+        )
+    if indices.size:
+        low, high = int(indices.min()), int(indices.max())
+        if low < 0 or high >= len(points):
+            wrong = low if low < 0 else high
+            raise SceneError(f"{owner}: index {wrong} is out of range, there are {len(points)} vertices")
+    for label, width in (("normals", 3), ("uvs", 2)):
+        values = getattr(mesh, label)
+        if values is not None and np.shape(values) != (len(points), width):
+            raise SceneError(f"{owner}: {label} must be [{len(points)}, {width}], got {list(np.shape(values))}")
+
+
+def distinct_materials(nodes: Sequence[Node]) -> list[Material]:
+    """Return the checked materials of all meshes, each once, in order of first use; raises SceneError."""
+    found = list({id(mesh.material): mesh.material for node in nodes for mesh in node.meshes}.values())
+    for material in found:
+        check_material(material)
+    return found
+
+
+def transform_points(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return ``points`` [n, 3] moved by ``matrix`` [4, 4], float32."""
+    if np.array_equal(matrix, np.eye(4)):
+        return np.asarray(points, np.float32)
+    return (np.asarray(points, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
+
+
+def transform_normals(matrix: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return unit normals [n, 3] moved by ``matrix``, float32; those without a direction become zero."""
+    linear = matrix[:3, :3]
+    cofactors = np.stack(
+        [np.cross(linear[1], linear[2]), np.cross(linear[2], linear[0]), np.cross(linear[0], linear[1])]
+    )
+    if np.linalg.det(linear) < 0.0:
+        cofactors = -cofactors
+    moved = np.nan_to_num(np.asarray(normals, np.float64), nan=0.0, posinf=0.0, neginf=0.0) @ cofactors.T
+    length = np.linalg.norm(moved, axis=1, keepdims=True)
+    return np.divide(moved, length, out=np.zeros_like(moved), where=length > 1e-12).astype(np.float32)
+
+
+def flatten(nodes: Sequence[Node], materials: Sequence[Material], world: Sequence[np.ndarray]) -> FlatGeometry:
+    """Return the triangles of all nodes, placed by ``world`` (world_from_node of each).
+
+    A mirroring transform turns its triangles' winding, so that fronts stay fronts.
+    """
+    vertex_count = sum(len(mesh.points) for node in nodes for mesh in node.meshes)
+    triangle_count = sum(len(mesh.indices) for node in nodes for mesh in node.meshes)
+    flat = FlatGeometry(
+        points=np.empty((vertex_count, 3), np.float32),
+        normals=np.zeros((vertex_count, 3), np.float32),
+        uvs=np.zeros((vertex_count, 2), np.float32),
+        indices=np.empty((triangle_count, 3), np.int32),
+        materials=np.empty(triangle_count, np.int32),
+        objects=np.empty(triangle_count, np.int32),
+        vertex_starts=[],
+    )
+    index_of = {id(material): index for index, material in enumerate(materials)}
+    vertex = triangle = object_index = 0
+    for node, matrix in zip(nodes, world, strict=True):
+        flat.vertex_starts.append(vertex)
+        mirrored = np.linalg.det(matrix[:3, :3]) < 0.0
+        for mesh in node.meshes:
+            vertices = slice(vertex, vertex + len(mesh.points))
+            triangles = slice(triangle, triangle + len(mesh.indices))
+            if mesh.uvs is not None:
+                flat.uvs[vertices] = np.nan_to_num(mesh.uvs)
+            flat.indices[triangles] = np.asarray(mesh.indices)[:, ::-1] if mirrored else mesh.indices
+            flat.indices[triangles] += vertex
+            flat.materials[triangles] = index_of[id(mesh.material)]
+            flat.objects[triangles] = object_index
+            vertex, triangle = vertices.stop, triangles.stop
+        place(flat, node, matrix, flat.vertex_starts[-1])
+        object_index += bool(node.meshes)
+    flat.vertex_starts.append(vertex)
+    return flat
+
+
+def place(flat: FlatGeometry, node: Node, matrix: np.ndarray, vertex: int) -> None:
+    """Write points and normals of ``node``'s meshes from ``vertex`` on, placed by ``matrix`` (world_from_node)."""
+    for mesh in node.meshes:
+        end = vertex + len(mesh.points)
+        flat.points[vertex:end] = transform_points(matrix, mesh.points)
+        if mesh.normals is not None:
+            flat.normals[vertex:end] = transform_normals(matrix, mesh.normals)
+        vertex = end

@@ -1,0 +1,354 @@
+"""The scene: nodes with meshes, lights, an environment, cameras, and the buffers kernels read."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from warp_gi.errors import SceneError, unknown_name
+from warp_gi.kernels import types
+from warp_gi.launch import get_device
+from warp_gi.scene import animation, emitters, geometry, textures
+from warp_gi.scene.model import Keyframe, Material, Node, PunctualLight
+
+if TYPE_CHECKING:
+    from warp_gi.camera import Camera
+    from warp_gi.scene.environment import Environment
+
+POSES_FOR_BOUNDS = 33
+"""Evenly spaced poses, beside those of the keyframes, that the bounds of an animated scene enclose."""
+
+
+class Scene:
+    """Everything that is rendered. Lengths in metres, y up, colours linear Rec. 709.
+
+    Args:
+        nodes: Placements of meshes; parents before children. The scene keeps copies of the nodes, not of the meshes.
+        lights: Lights without size.
+        environment: The sky: a path to a map, an RGB radiance, an Environment, a SunSky, or None for black.
+        cameras: Cameras by name, in world space, at time 0.
+        name: Shown in reports.
+        camera_nodes: Which node carries a camera, by the camera's name, for cameras that move with a node.
+
+    Raises SceneError if anything in it cannot be rendered: one line that names the mesh, material or light.
+    """
+
+    def __init__(
+        self,
+        nodes: Sequence[Node],
+        lights: Sequence[PunctualLight] = (),
+        environment: Any = None,
+        cameras: Mapping[str, Camera] | None = None,
+        name: str = "scene",
+        camera_nodes: Mapping[str, int] | None = None,
+    ) -> None:
+        self.name = name
+        self.nodes: list[Node] = [replace(node) for node in nodes]
+        self.lights: list[PunctualLight] = list(lights)
+        self.cameras: dict[str, Camera] = dict(cameras or {})
+        self.camera_nodes: dict[str, int] = dict(camera_nodes or {})
+        geometry.check_nodes(self.nodes)
+        self.materials: list[Material] = geometry.distinct_materials(self.nodes)
+        for light in self.lights:
+            emitters.check_light(light, self.nodes)
+        self._flatten()
+        self._environment: Environment | None = None
+        self.environment = environment
+
+    def _flatten(self) -> None:
+        """Build what follows from the nodes; call again when keyframes change."""
+        self._moving = animation.moving_nodes(self.nodes)
+        world = animation.world_matrices(self.nodes, 0.0)
+        self._flat = geometry.flatten(self.nodes, self.materials, world)
+        if not np.isfinite(self._flat.points).all():
+            raise SceneError(f"scene {self.name!r}: node transforms move vertices past the range of float32")
+        self._emissive, self._triangle_powers = emitters.emissive_triangles(self._flat, self.materials)
+        self._bounds = self._all_bounds()
+        self._devices: dict[str, _DeviceScene] = {}
+        self._geometry_hash: str | None = None
+
+    # ---- what is in it ----
+
+    @property
+    def environment(self) -> Environment | None:
+        """The sky; set it to a path, an RGB radiance, an Environment, a SunSky or None. The geometry stays built."""
+        return self._environment
+
+    @environment.setter
+    def environment(self, value: Any) -> None:
+        if value is not None:
+            from warp_gi.scene.environment import as_environment
+
+            value = as_environment(value)
+        self._environment = value
+        for device_scene in self._devices.values():
+            device_scene.set_environment(value)
+
+    @property
+    def triangle_count(self) -> int:
+        """Number of triangles of all nodes together."""
+        return len(self._flat.indices)
+
+    @property
+    def emitter_count(self) -> int:
+        """Number of emissive triangles and punctual lights together."""
+        return len(self._emissive) + len(self.lights)
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Lowest and highest corner, float32 [2, 3], metres; of an animated scene over all of its time."""
+        return self._bounds.copy()
+
+    @property
+    def radius(self) -> float:
+        """Half the diagonal of the bounds, metres."""
+        return float(np.linalg.norm(self._bounds[1].astype(np.float64) - self._bounds[0])) / 2.0
+
+    @property
+    def object_names(self) -> list[str]:
+        """Names of the nodes with meshes, by object id."""
+        return [node.name for node in self.nodes if node.meshes]
+
+    @property
+    def is_animated(self) -> bool:
+        """Whether any node has keyframes."""
+        return any(self._moving)
+
+    @property
+    def duration(self) -> float:
+        """Time of the last keyframe in seconds; 0 if nothing moves."""
+        return max(animation.key_times(self.nodes), default=0.0)
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of the geometry, materials and textures on one device, without the ray query tree and the sky."""
+        flat = self._flat
+        arrays = (flat.points, flat.normals, flat.uvs, flat.indices, flat.materials, flat.objects)
+        texels = {id(t.pixels): t.pixels.nbytes for t in textures.distinct_textures(self.materials)}
+        per_triangle = 4 * self.triangle_count  # Geometry.emitters
+        previous = flat.points.nbytes if self.is_animated else 0
+        return sum(a.nbytes for a in arrays) + sum(texels.values()) + per_triangle + previous
+
+    def emitter_powers(self) -> np.ndarray:
+        """Return the power of each emitter [W, as luminance], float64 [emitter_count].
+
+        Above zero for every emissive triangle; textures count by their mean under the triangle.
+        """
+        lights = [emitters.light_power(light, self.radius) for light in self.lights]
+        return np.concatenate([self._triangle_powers, lights])
+
+    @property
+    def geometry_hash(self) -> str:
+        """sha256 of all that decides visibility: triangles, alpha masks, animation."""
+        if self._geometry_hash is None:
+            digest = hashlib.sha256(b"warp_gi geometry 1")
+            flat = self._flat
+            masked = np.array([m.alpha_cutoff is not None for m in self.materials])
+            _update(digest, flat.points, flat.indices)
+            if masked.any():
+                triangles = masked[flat.materials]
+                _update(digest, triangles, flat.materials[triangles], flat.uvs[flat.indices[triangles]])
+                for material in (m for m in self.materials if m.alpha_cutoff is not None):
+                    texture = material.base_color_texture
+                    _update(digest, np.array([material.alpha, material.alpha_cutoff]))
+                    if texture is not None:
+                        _update(digest, repr(texture.wrap), texture.pixels[..., 3])
+            for index, node in enumerate(self.nodes):
+                if self._moving[index]:
+                    keys = [asdict(key) for key in node.keyframes or ()]
+                    start, stop = self._flat.vertex_starts[index : index + 2]
+                    _update(digest, repr((start, stop, node.parent, keys)), np.asarray(node.parent_from_node))
+            self._geometry_hash = digest.hexdigest()
+        return self._geometry_hash
+
+    @property
+    def hash(self) -> str:
+        """sha256 of all that decides the pictures but the cameras; equal in every process."""
+        digest = hashlib.sha256(b"warp_gi scene 1" + self.geometry_hash.encode())
+        flat = self._flat
+        _update(digest, flat.normals, flat.uvs, flat.materials, flat.objects)
+        images = textures.distinct_textures(self.materials)
+        _update(digest, textures.material_table(self.materials, images))
+        for image in images:
+            _update(digest, repr((image.srgb, image.wrap)), image.pixels)
+        world = animation.world_matrices(self.nodes, 0.0)
+        _update(digest, emitters.emitter_table(self._emissive, self.lights, world))
+        _update(digest, repr([light.node for light in self.lights]))
+        _update(digest, "no sky" if self._environment is None else self._environment.content_hash)
+        return digest.hexdigest()
+
+    # ---- what moves ----
+
+    def animate(self, node: str, keyframes: Sequence[Keyframe]) -> None:
+        """Replace the pose of a node (in its parent's space) by keyframes; bakes and device buffers start afresh.
+
+        Raises SceneError for bad keyframes or if several nodes have the name, OptionError if none has.
+        """
+        matches = [index for index, candidate in enumerate(self.nodes) if candidate.name == node]
+        if not matches:
+            raise unknown_name("node", node, {candidate.name for candidate in self.nodes})
+        if len(matches) > 1:
+            raise SceneError(f"{len(matches)} nodes are named {node!r}; give the one to animate a name of its own")
+        animation.check_keyframes(keyframes, node)
+        self.nodes[matches[0]].keyframes = list(keyframes)
+        self._flatten()
+
+    def world_from_node(self, index: int, time: float) -> np.ndarray:
+        """Return the placement of node ``index`` at ``time`` [s], float64 [4, 4]."""
+        return animation.world_matrices(self.nodes, time)[index]
+
+    def update(self, time: float, previous_time: float | None = None, device: str | wp.Device | None = None) -> bool:
+        """Move the buffers of ``data(device)`` to ``time`` [s]; return whether anything differs from the last call.
+
+        ``previous_points`` get the pose of ``previous_time``, from which motion vectors
+        follow; None is ``time``, no motion. Nothing is done for a scene without keyframes,
+        and the tree is refit only if a vertex moved.
+        """
+        if not self.is_animated:
+            return False
+        self.data(device)
+        return self._devices[_device(device).alias].move(time, time if previous_time is None else previous_time)
+
+    # ---- what kernels read ----
+
+    def data(self, device: str | wp.Device | None = None) -> types.SceneData:
+        """Return the scene on a device, built at the first call and kept; at time 0 until ``update``.
+
+        The alias tables of the emitters are empty: each light sampler fills its own.
+        """
+        device = _device(device)
+        if device.alias not in self._devices:
+            self._devices[device.alias] = _DeviceScene(self, device)
+        return self._devices[device.alias].data
+
+    def bvh(self, device: str | wp.Device | None = None) -> Any:
+        """Return the TriangleBvh behind ``data(device)``."""
+        self.data(device)
+        return self._devices[_device(device).alias].bvh
+
+    def _all_bounds(self) -> np.ndarray:
+        flat = self._flat
+        used = np.unique(flat.indices) if len(flat.points) > 3 * len(flat.indices) else slice(None)
+        boxes = [flat.points[used].min(axis=0), flat.points[used].max(axis=0)]
+        if self.is_animated:
+            times = {*np.linspace(0.0, self.duration, POSES_FOR_BOUNDS), *animation.key_times(self.nodes)}
+            for world in (animation.world_matrices(self.nodes, time) for time in sorted(times)):
+                for node, matrix, moving in zip(self.nodes, world, self._moving, strict=True):
+                    for mesh in node.meshes if moving else ():
+                        corners = np.stack([mesh.points.min(axis=0), mesh.points.max(axis=0)])
+                        corners = np.stack(np.meshgrid(*corners.T, indexing="ij"), axis=-1).reshape(8, 3)
+                        boxes.extend(geometry.transform_points(matrix, corners))
+        return np.stack([np.min(boxes, axis=0), np.max(boxes, axis=0)]).astype(np.float32)
+
+
+class _DeviceScene:
+    """The buffers of a scene on one device, and the pose they are in."""
+
+    def __init__(self, scene: Scene, device: wp.Device) -> None:
+        from warp_gi.bvh import AlphaMasks, TriangleBvh
+
+        self.scene, self.device = scene, device
+        self.world = self.previous_world = animation.world_matrices(scene.nodes, 0.0)
+        flat = scene._flat
+        if scene.is_animated:
+            flat = replace(flat, points=flat.points.copy(), normals=flat.normals.copy())
+        self.flat = flat
+        self.previous_points = flat.points.copy() if scene.is_animated else flat.points
+        self.emitters = emitters.emitter_table(scene._emissive, scene.lights, self.world)
+        emitter_of = np.full(scene.triangle_count, -1, np.int32)
+        emitter_of[scene._emissive] = np.arange(len(scene._emissive), dtype=np.int32)
+        images = textures.distinct_textures(scene.materials)
+        texture_rows, texels = textures.texture_table(images)
+
+        data = types.SceneData()
+        data.geometry.points = self._array(flat.points, wp.vec3)
+        data.geometry.previous_points = (
+            self._array(self.previous_points, wp.vec3) if scene.is_animated else data.geometry.points
+        )
+        data.geometry.normals = self._array(flat.normals, wp.vec3)
+        data.geometry.uvs = self._array(flat.uvs, wp.vec2)
+        data.geometry.indices = self._array(flat.indices, wp.vec3i)
+        data.geometry.materials = self._array(flat.materials, wp.int32)
+        data.geometry.objects = self._array(flat.objects, wp.int32)
+        data.geometry.emitters = self._array(emitter_of, wp.int32)
+        data.materials = self._array(textures.material_table(scene.materials, images), types.Material)
+        data.textures = self._array(texture_rows, types.Texture)
+        data.texels = self._array(texels, wp.uint32)
+        data.srgb_to_linear = self._array(textures.SRGB_TO_LINEAR.copy(), wp.float32)
+        data.emitters.count = len(self.emitters)
+        data.emitters.emitters = self._array(self.emitters, types.Emitter)
+        data.emitters.alias_probability = wp.empty(0, dtype=wp.float32, device=device)
+        data.emitters.alias_index = wp.empty(0, dtype=wp.int32, device=device)
+        data.emitters.pdf = wp.empty(0, dtype=wp.float32, device=device)
+        low, high = scene.bounds
+        data.center = wp.vec3(*(float(x) for x in (low.astype(np.float64) + high) / 2.0))
+        data.radius = scene.radius
+        alpha = None
+        if any(m.alpha_cutoff is not None for m in scene.materials):
+            alpha = AlphaMasks.of(data)
+        self.bvh = TriangleBvh(data.geometry.points, data.geometry.indices, device=device, alpha=alpha)
+        data.bvh = self.bvh.data
+        self.data = data
+        self.set_environment(scene.environment)
+
+    def _array(self, values: np.ndarray, dtype: Any) -> wp.array:
+        """Return ``values`` on the device; on the CPU the same memory."""
+        return wp.array(values, dtype=dtype, device=self.device, copy=not self.device.is_cpu)
+
+    def set_environment(self, environment: Environment | None) -> None:
+        self.data.environment = types.Environment() if environment is None else environment.data(self.device)
+
+    def move(self, time: float, previous_time: float) -> bool:
+        """Bring points, normals and lights to ``time`` and previous points to ``previous_time``."""
+        nodes, flat, target = self.scene.nodes, self.flat, self.data.geometry
+        world = animation.world_matrices(nodes, time)
+        previous_world = animation.world_matrices(nodes, previous_time)
+        moved = changed = False
+        for index, node in enumerate(nodes):
+            start, stop = flat.vertex_starts[index : index + 2]
+            if start == stop or not self.scene._moving[index]:
+                continue
+            if not np.array_equal(previous_world[index], self.previous_world[index]):
+                vertex = start
+                for mesh in node.meshes:
+                    end = vertex + len(mesh.points)
+                    self.previous_points[vertex:end] = geometry.transform_points(previous_world[index], mesh.points)
+                    vertex = end
+                self._upload(target.previous_points, self.previous_points, start, stop)
+                changed = True
+            if not np.array_equal(world[index], self.world[index]):
+                geometry.place(flat, node, world[index], start)
+                self._upload(target.points, flat.points, start, stop)
+                self._upload(target.normals, flat.normals, start, stop)
+                moved = True
+        if any(light.node is not None and self.scene._moving[light.node] for light in self.scene.lights):
+            self.emitters[:] = emitters.emitter_table(self.scene._emissive, self.scene.lights, world)
+            self._upload(self.data.emitters.emitters, self.emitters, len(self.scene._emissive), len(self.emitters))
+        self.world, self.previous_world = world, previous_world
+        if moved:
+            self.bvh.refit(target.points)
+        return moved or changed
+
+    def _upload(self, target: wp.array, source: np.ndarray, start: int, stop: int) -> None:
+        """Copy items from ``start`` to ``stop``; on the CPU target and source are the same memory."""
+        if not self.device.is_cpu:
+            target[start:stop].assign(source[start:stop])
+
+
+def _device(device: str | wp.Device | None) -> wp.Device:
+    return device if isinstance(device, wp.Device) else get_device(device)
+
+
+def _update(digest: Any, *parts: np.ndarray | str) -> None:
+    """Add arrays (with their dtype and shape) and texts to a digest."""
+    for part in parts:
+        if isinstance(part, str):
+            digest.update(part.encode())
+        else:
+            digest.update(repr((part.dtype.str if part.dtype.names is None else "", part.shape)).encode())
+            digest.update(np.ascontiguousarray(part).view(np.uint8).reshape(-1).data)

@@ -1,0 +1,118 @@
+"""Images and materials as the kernels read them: one buffer of texels, one table each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from warp_gi.errors import SceneError
+from warp_gi.kernels import types
+from warp_gi.scene.model import Material, Texture
+
+WRAPS = {"repeat": types.WRAP_REPEAT, "clamp": types.WRAP_CLAMP, "mirror": types.WRAP_MIRROR}
+
+TEXTURE_SLOTS = ("base_color_texture", "metallic_roughness_texture", "normal_texture", "emission_texture")
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Weights of linear Rec. 709 red, green and blue."""
+
+
+def _srgb_table() -> np.ndarray:
+    code = np.arange(256) / 255.0
+    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+SRGB_TO_LINEAR = _srgb_table()
+"""float32 [256]: linear value of an 8-bit sRGB code (IEC 61966-2-1)."""
+
+
+def check_texture(texture: Texture, owner: str) -> None:
+    """Raise SceneError unless ``texture`` has pixels, uint8 [height, width, 4], and known wrap modes."""
+    pixels, name = texture.pixels, f"{owner}, texture {texture.name!r}"
+    shape = getattr(pixels, "shape", None)
+    if shape is None or len(shape) != 3 or shape[2] != 4 or pixels.dtype != np.uint8:
+        raise SceneError(
+            f"{name}: expected uint8 pixels [height, width, 4], got {getattr(pixels, 'dtype', '')} {shape}"
+        )
+    if 0 in shape:
+        raise SceneError(f"{name}: expected at least 1x1 pixels, got {shape[1]}x{shape[0]}")
+    for wrap in texture.wrap:
+        if wrap not in WRAPS:
+            raise SceneError(f"{name}: unknown wrap mode {wrap!r} (known: {', '.join(WRAPS)})")
+
+
+def check_material(material: Material) -> None:
+    """Raise SceneError where a field of ``material`` is out of its range or not finite."""
+    owner = f"material {material.name!r}"
+
+    def within(label: str, values: object, low: float, high: float) -> None:
+        array = np.asarray(values, np.float64)
+        if not np.all((array >= low) & (array <= high)):
+            raise SceneError(f"{owner}: {label} must be from {low:g} to {high:g}, got {values}")
+
+    for label, size in (("base_color", 3), ("emission", 3)):
+        if np.shape(getattr(material, label)) != (size,):
+            raise SceneError(f"{owner}: {label} must be {size} numbers, got {getattr(material, label)!r}")
+    for label in ("base_color", "alpha", "metallic", "roughness", "specular"):
+        within(label, getattr(material, label), 0.0, 1.0)
+    within("emission", material.emission, 0.0, 1e30)
+    within("normal_scale", material.normal_scale, -1e6, 1e6)
+    if material.alpha_cutoff is not None:
+        within("alpha_cutoff", material.alpha_cutoff, 0.0, 1.0)
+    for slot in TEXTURE_SLOTS:
+        texture = getattr(material, slot)
+        if texture is not None:
+            check_texture(texture, owner)
+
+
+def distinct_textures(materials: Sequence[Material]) -> list[Texture]:
+    """Return the textures of ``materials``, each once, in order of first use."""
+    found = {id(t): t for m in materials for t in (getattr(m, slot) for slot in TEXTURE_SLOTS) if t is not None}
+    return list(found.values())
+
+
+def texture_table(textures: Sequence[Texture]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the table (dtype of types.Texture) and the texels (uint32, red in the low byte, bottom row first).
+
+    Textures that share one array of pixels share their texels. Raises SceneError
+    past 2**31 texels.
+    """
+    images = list({id(texture.pixels): texture.pixels for texture in textures}.values())
+    sizes = [image.shape[0] * image.shape[1] for image in images]
+    if sum(sizes) >= 2**31:
+        raise SceneError(f"textures hold {sum(sizes)} texels, more than 2^31; scale them down")
+    starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    texels = np.empty(max(int(starts[-1]), 1), np.uint32)
+    texels[starts[-1] :] = 0
+    start_of = {}
+    for image, start, size in zip(images, starts, sizes, strict=False):
+        start_of[id(image)] = start
+        texels[start : start + size].view(np.uint8).reshape(image.shape)[:] = image[::-1]
+    table = np.zeros(len(textures), types.Texture.numpy_dtype())
+    for row, texture in zip(table, textures, strict=True):
+        height, width = texture.pixels.shape[:2]
+        wrap_u, wrap_v = (WRAPS[wrap] for wrap in texture.wrap)
+        row[...] = (start_of[id(texture.pixels)], width, height, wrap_u, wrap_v, int(texture.srgb))
+    return table, texels
+
+
+def material_table(materials: Sequence[Material], textures: Sequence[Texture]) -> np.ndarray:
+    """Return the materials as an array with the dtype of types.Material; textures by their index in ``textures``."""
+    index_of = {id(texture): index for index, texture in enumerate(textures)}
+    table = np.zeros(len(materials), types.Material.numpy_dtype())
+    for row, material in zip(table, materials, strict=True):
+        for label in ("base_color", "alpha", "metallic", "roughness", "specular", "normal_scale", "emission"):
+            row[label] = getattr(material, label)
+        row["alpha_cutoff"] = -1.0 if material.alpha_cutoff is None else material.alpha_cutoff
+        row["double_sided"] = int(material.double_sided)
+        for slot in TEXTURE_SLOTS:
+            texture = getattr(material, slot)
+            row[slot] = -1 if texture is None else index_of[id(texture)]
+    return table
+
+
+def linear_rgb(texture: Texture) -> np.ndarray:
+    """Return float32 [height, width, 3], linear, row 0 at the top."""
+    rgb = texture.pixels[..., :3]
+    return SRGB_TO_LINEAR[rgb] if texture.srgb else rgb.astype(np.float32) / 255.0
