@@ -1,0 +1,175 @@
+"""EXR files with named layers and metadata, through OpenImageIO.
+
+One part, scan lines, ZIP. Layers follow the usual names: ``R G B`` for the picture,
+``N.X``, ``P.X``, ``Z``, ``motion.u``, ``albedo.R`` and so on. Colours and normals are
+half unless a value is past half's range; positions, depth, motion, identifiers and
+variance are float. No capture date is written, so equal frames are equal files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from warp_gi.errors import OptionError, SceneError
+
+HALF_MAX = 65504.0
+
+Attribute = str | int | float | np.ndarray
+
+# buffer -> its channels in the file; other buffers are named after themselves
+_CHANNELS = {
+    "beauty": ("R", "G", "B"),
+    "normal": ("N.X", "N.Y", "N.Z"),
+    "position": ("P.X", "P.Y", "P.Z"),
+    "depth": ("Z",),
+    "motion": ("motion.u", "motion.v"),
+    "object_id": ("objectId",),
+    "material_id": ("materialId",),
+}
+_BUFFER_OF_CHANNEL = {channel: name for name, channels in _CHANNELS.items() for channel in channels}
+_ALWAYS_FLOAT = {"position", "depth", "motion", "object_id", "material_id", "variance"}
+_INTEGER = {"object_id", "material_id"}
+
+
+def channel_names(buffer: str, count: int) -> tuple[str, ...]:
+    """Return the EXR channels that hold a buffer of ``count`` values a pixel."""
+    known = _CHANNELS.get(buffer)
+    if known is not None and len(known) == count:
+        return known
+    if count == 1:
+        return (buffer,)
+    if count > 4:
+        raise OptionError(f"buffer {buffer!r} has {count} values a pixel; an EXR layer here takes 1 to 4")
+    return tuple(f"{buffer}.{letter}" for letter in ("uv" if count == 2 else "RGBA"[:count]))
+
+
+def stored_format(buffer: str, values: np.ndarray, precision: str = "half") -> str:
+    """Return "half" or "float", the format ``buffer`` is stored in."""
+    if precision == "float" or buffer in _ALWAYS_FLOAT:
+        return "float"
+    finite = values[np.isfinite(values)]
+    return "float" if finite.size and np.abs(finite).max() > HALF_MAX else "half"
+
+
+def stored_values(buffer: str, values: np.ndarray, precision: str = "half") -> np.ndarray:
+    """Return the values of ``buffer`` as reading the file gives them back (float32)."""
+    values = np.asarray(values, dtype=np.float32)
+    if stored_format(buffer, values, precision) == "half":
+        return values.astype(np.float16).astype(np.float32)
+    return values
+
+
+def plain(value: object) -> str | int | float:
+    """Return a metadata value in the form that a file gives back: int32, float32 or text."""
+    if isinstance(value, bool | np.bool_):
+        return int(value)
+    if isinstance(value, int | np.integer):
+        return int(value) if -(2**31) <= int(value) < 2**31 else str(int(value))
+    if isinstance(value, float | np.floating):
+        return float(np.float32(value))
+    return str(value)
+
+
+def write_exr(
+    path: str | Path,
+    buffers: Mapping[str, np.ndarray],
+    attributes: Mapping[str, Attribute],
+    precision: str = "half",
+) -> None:
+    """Write ``buffers`` (each [height, width] or [height, width, 1 to 4]) and ``attributes`` to ``path``.
+
+    Attributes are text, numbers or 4x4 matrices (stored in row-vector convention as they are).
+    ``precision`` is "half" or "float" for the buffers that may be either.
+    Raises OSError when the file cannot be written, OptionError for buffers of unequal size.
+    """
+    import OpenImageIO as oiio
+
+    if precision not in ("half", "float"):
+        raise OptionError(f"EXR precision must be 'half' or 'float', got {precision!r}")
+    names: list[str] = []
+    formats: list[str] = []
+    planes: list[np.ndarray] = []
+    for buffer, values in buffers.items():
+        values = np.asarray(values)
+        if buffer in _INTEGER and values.size and np.abs(values).max() > 2**24:
+            raise OptionError(f"buffer {buffer!r} has identifiers above 2^24, which an EXR float cannot hold")
+        values = stored_values(buffer, values, precision)
+        values = values.reshape(*values.shape[:2], -1)
+        if planes and values.shape[:2] != planes[0].shape[:2]:
+            raise OptionError(f"buffer {buffer!r} is {values.shape[:2]}, the others are {planes[0].shape[:2]}")
+        names += channel_names(buffer, values.shape[2])
+        formats += [stored_format(buffer, values, precision)] * values.shape[2]
+        planes.append(values)
+    if not planes:
+        raise OptionError("an EXR file needs at least one buffer")
+    pixels = np.ascontiguousarray(np.concatenate(planes, axis=2))
+    height, width, count = pixels.shape
+    spec = oiio.ImageSpec(width, height, count, "float")
+    spec.channelnames = tuple(names)
+    spec.channelformats = tuple(formats)
+    spec.attribute("compression", "zip")
+    spec.attribute("DateTime", "")  # else the time of day goes into every file
+    for name, value in attributes.items():
+        if isinstance(value, np.ndarray):
+            spec.attribute(name, "matrix", tuple(float(v) for v in np.asarray(value).reshape(16)))
+        else:
+            spec.attribute(name, plain(value))
+    output = oiio.ImageOutput.create("exr")
+    written = output.open(str(path), spec) and output.write_image(pixels)
+    problem = output.geterror()
+    closed = output.close()
+    if not written or not closed or problem:
+        problem = " ".join((problem or output.geterror() or "unknown failure").split())
+        raise OSError(f"cannot write {path}: {problem}")
+
+
+def read_exr(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Attribute], dict[str, str]]:
+    """Read an EXR file: its buffers by name, its attributes, and the format ("half", "float") of each buffer.
+
+    Buffers are float32 [height, width] or [height, width, channels], identifiers int32; a
+    file by another program gives its layers by the same rules. Matrices come back as float32
+    [4, 4]. Raises SceneError when the file is missing, torn or not an EXR.
+    """
+    import OpenImageIO as oiio
+
+    if not Path(path).is_file():
+        raise SceneError(f"{path}: no such file")
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        raise SceneError(f"{path}: not a whole EXR file ({' '.join(oiio.geterror().split())})")
+    try:
+        spec = source.spec()
+        pixels = source.read_image("float")
+        problem = source.geterror()  # missing scan lines are reported here, with zeros in the pixels
+    finally:
+        source.close()
+    if pixels is None or problem:
+        raise SceneError(f"{path}: not a whole EXR file ({' '.join((problem or 'no pixels').split())})")
+    formats = [str(format) for format in spec.channelformats] or [str(spec.format)] * spec.nchannels
+    groups: dict[str, list[int]] = {}
+    for index, channel in enumerate(spec.channelnames):
+        groups.setdefault(_buffer_of(channel), []).append(index)
+    buffers = {}
+    for buffer, indices in groups.items():
+        order = (
+            {name: rank for rank, name in enumerate(channel_names(buffer, len(indices)))} if len(indices) < 5 else {}
+        )
+        indices.sort(key=lambda i: order.get(spec.channelnames[i], i))
+        values = np.ascontiguousarray(pixels[:, :, indices] if len(indices) > 1 else pixels[:, :, indices[0]])
+        buffers[buffer] = values.astype(np.int32) if buffer in _INTEGER else values
+    attributes: dict[str, Attribute] = {}
+    for item in spec.extra_attribs:
+        is_matrix = str(item.type) == "matrix"
+        attributes[item.name] = np.array(item.value, np.float32).reshape(4, 4) if is_matrix else item.value
+    return buffers, attributes, {buffer: formats[indices[0]] for buffer, indices in groups.items()}
+
+
+def _buffer_of(channel: str) -> str:
+    if channel in _BUFFER_OF_CHANNEL:
+        return _BUFFER_OF_CHANNEL[channel]
+    if channel == "A":
+        return "alpha"
+    return channel.rpartition(".")[0] or channel

@@ -1,0 +1,55 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+
+@contextlib.contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path beside ``path`` to write to; it is renamed to ``path`` if the block succeeds.
+
+    A file at ``path`` stays until the new one is complete and on disk. When the block
+    raises, the temporary file is removed. Missing folders are made.
+    Raises OSError when the folder cannot be written to.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part.write_bytes(b"")
+    try:
+        yield part
+        with open(part, "rb+") as written:
+            os.fsync(written.fileno())
+        os.replace(part, path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def remove_stale_parts(path: str | Path) -> None:
+    """Remove the temporary files that a killed process left for ``path``; those of living processes stay."""
+    path = Path(path)
+    name = re.compile(rf"\.{re.escape(path.name)}\.(\d+)\.part")
+    if not path.parent.is_dir():
+        return
+    for candidate in path.parent.iterdir():
+        match = name.fullmatch(candidate.name)
+        if match and (int(match[1]) == os.getpid() or not _is_running(int(match[1]))):
+            candidate.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    if os.name == "nt":  # os.kill would end the process there
+        return False
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True

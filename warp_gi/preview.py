@@ -1,0 +1,55 @@
+"""Tone-mapped previews.
+
+The curve is Stephen Hill's fit of the ACES reference and output transforms: a matrix
+that desaturates bright colours, a filmic curve with toe and shoulder, and a matrix back,
+then the sRGB coding. Scene values are divided by 0.6 first, so that middle grey stays
+about where it is. Exposure is in stops and fixed: previews of a sequence do not pump.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from warp_gi.files import replacing
+
+_MIDDLE = 0.6
+_INPUT = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]])
+_OUTPUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]])
+
+
+def tone_map(image: np.ndarray, exposure: float = 0.0) -> np.ndarray:
+    """Return linear radiance [height, width, 3] as sRGB uint8 [height, width, 3].
+
+    ``exposure`` is in stops: +1 doubles the light. NaN becomes black, infinity white.
+    """
+    light = np.nan_to_num(np.asarray(image, np.float64), nan=0.0, posinf=1e6, neginf=0.0)
+    x = np.clip(light * 2.0**exposure / _MIDDLE, 0, 1e6) @ _INPUT.T
+    x = (x * (x + 0.0245786) - 0.000090537) / (x * (0.983729 * x + 0.4329510) + 0.238081)
+    return to_bytes(encode_srgb(x @ _OUTPUT.T))
+
+
+def encode_srgb(linear: np.ndarray) -> np.ndarray:
+    """Return linear values, clipped to 0..1, in sRGB coding; the inverse of ``decode_srgb``."""
+    x = np.clip(linear, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+
+
+def decode_srgb(coded: np.ndarray) -> np.ndarray:
+    """Return sRGB-coded values 0..1 as linear ones; the inverse of ``encode_srgb``."""
+    x = np.asarray(coded, np.float64)
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+
+
+def to_bytes(values: np.ndarray) -> np.ndarray:
+    """Return values 0..1 rounded to uint8 0..255."""
+    return np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
+
+
+def write_png(path: str | Path, pixels: np.ndarray) -> None:
+    """Write uint8 [height, width, 3] as PNG; the file appears whole or not at all. Raises OSError."""
+    from PIL import Image
+
+    with replacing(path) as part:
+        Image.fromarray(pixels).save(part, format="PNG")
