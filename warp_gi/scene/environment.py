@@ -34,6 +34,7 @@ __all__ = ["Environment", "SunSky", "as_environment"]
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 LARGEST_HEIGHT = 4096  # texel indices and the random number that picks one must fit float32
+NEGLIGIBLE_NEGATIVE = 1e-4  # of the sum of all pixels
 
 
 class _Map:
@@ -119,15 +120,17 @@ class Environment:
         """Read a 2:1 latitude-longitude image (EXR, HDR or what else OpenImageIO reads; integers as sRGB).
 
         Raises SceneError if the file is missing or damaged, not 2:1, or has NaN or infinite pixels.
-        Negative pixels, which resampling filters leave behind, are set to 0 with a warning.
+        Negative pixels, which resampling filters leave behind, are set to 0; with a warning if they matter.
         """
         pixels = _read_image(Path(path))
         name = f"environment {str(path)!r}"
-        negative = pixels < 0
-        if negative.any():
-            count = int(negative.any(-1).sum())
-            warnings.warn(f"{name}: {count} pixels are negative (lowest {pixels.min():.3g}); set to 0", stacklevel=2)
-            pixels = np.where(negative, np.float32(0), pixels)
+        if pixels.min() < 0:
+            if -pixels[pixels < 0].sum() > NEGLIGIBLE_NEGATIVE * np.abs(pixels).sum():
+                count = int((pixels < 0).any(-1).sum())
+                warnings.warn(
+                    f"{name}: {count} pixels are negative (lowest {pixels.min():.3g}); set to 0", stacklevel=2
+                )
+            pixels = np.maximum(pixels, 0)
         return Environment(pixels=pixels, rotation=rotation, scale=scale, name=name)
 
     @staticmethod
@@ -261,7 +264,7 @@ def _read_image(path: Path) -> np.ndarray:
     if spec.nchannels < 3:
         colors = [0, 0, 0]
     pixels = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)[..., colors]
-    if not spec.format.is_floating_point:
+    if spec.format.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE):
         pixels = np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4).astype(np.float32)
     return np.ascontiguousarray(pixels)
 

@@ -1,0 +1,391 @@
+"""The sky: orientation, sampling against its pdf, energy, and what loading refuses."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+from statistics_tools import chi_squared
+from warp_gi.kernels.alias import alias_choice, alias_choice_small
+from warp_gi.kernels.environment import (
+    environment_pdf,
+    environment_radiance,
+    environment_sample,
+    lat_long_decode,
+    lat_long_encode,
+)
+from warp_gi.kernels.types import Environment as EnvironmentData
+
+from warp_gi import launch
+from warp_gi.alias import AliasTable
+from warp_gi.errors import OptionError, SceneError
+from warp_gi.scene.environment import Environment, SunSky, as_environment
+
+DEVICES = ["cpu", "cuda"] if wp.is_cuda_available() else ["cpu"]
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def sample_directions(
+    first: wp.int32,
+    env: EnvironmentData,
+    numbers: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    radiance: wp.array(dtype=wp.vec3),
+    pdf: wp.array(dtype=wp.float32),
+):
+    i = first + wp.tid()
+    s = environment_sample(env, numbers[i])
+    directions[i] = s.direction
+    radiance[i] = s.radiance
+    pdf[i] = s.pdf
+
+
+@wp.kernel
+def look_up(
+    first: wp.int32,
+    env: EnvironmentData,
+    directions: wp.array(dtype=wp.vec3),
+    radiance: wp.array(dtype=wp.vec3),
+    pdf: wp.array(dtype=wp.float32),
+):
+    i = first + wp.tid()
+    radiance[i] = environment_radiance(env, directions[i])
+    pdf[i] = environment_pdf(env, directions[i])
+
+
+@wp.kernel
+def encode_decode(first: wp.int32, directions: wp.array(dtype=wp.vec3), uvs: wp.array(dtype=wp.vec2)):
+    i = first + wp.tid()
+    uvs[i] = lat_long_encode(directions[i])
+    directions[i] = lat_long_decode(uvs[i])
+
+
+@wp.kernel
+def choose(
+    first: wp.int32,
+    probability: wp.array(dtype=wp.float32),
+    index: wp.array(dtype=wp.int32),
+    numbers: wp.array(dtype=wp.vec2),
+    items: wp.array2d(dtype=wp.int32),
+    remainders: wp.array2d(dtype=wp.float32),
+):
+    i = first + wp.tid()
+    a = alias_choice(probability, index, probability.shape[0], numbers[i][0], numbers[i][1])
+    b = alias_choice_small(probability, index, probability.shape[0], numbers[i][0])
+    items[i, 0] = a.item
+    items[i, 1] = b.item
+    remainders[i, 0] = a.remainder
+    remainders[i, 1] = b.remainder
+
+
+def evaluate(env: Environment, directions: np.ndarray, device: str = "cpu") -> tuple[np.ndarray, np.ndarray]:
+    points = wp.array(directions.astype(np.float32), dtype=wp.vec3, device=device)
+    radiance = wp.zeros(len(directions), dtype=wp.vec3, device=device)
+    pdf = wp.zeros(len(directions), dtype=wp.float32, device=device)
+    launch.launch(look_up, len(directions), [env.data(device), points, radiance, pdf], wp.get_device(device))
+    return radiance.numpy(), pdf.numpy()
+
+
+def sample(
+    env: Environment, count: int, device: str = "cpu", seed: int = 0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    numbers = np.random.default_rng(seed).random((count, 3), dtype=np.float32)
+    outputs = [wp.zeros(count, dtype=t, device=device) for t in (wp.vec3, wp.vec3, wp.float32)]
+    inputs = [env.data(device), wp.array(numbers, dtype=wp.vec3, device=device), *outputs]
+    launch.launch(sample_directions, count, inputs, wp.get_device(device))
+    return tuple(x.numpy() for x in outputs)
+
+
+def random_directions(count: int, seed: int = 1) -> np.ndarray:
+    d = np.random.default_rng(seed).standard_normal((count, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def spotted_map(height: int) -> np.ndarray:
+    """Zero over a third of the sphere, noise elsewhere, one texel far brighter, bright spots at both poles."""
+    pixels = np.random.default_rng(3).random((height, 2 * height, 3)).astype(np.float32)
+    pixels[:, : 2 * height // 3] = 0
+    pixels[height // 3, height] = 50.0
+    pixels[0, 2 * height - 3] = pixels[-1, 2 * height - 5] = 20.0
+    return pixels
+
+
+def row_edges(height: int) -> np.ndarray:
+    """Polar angles between cells of rows: nodes stand at both poles."""
+    return np.clip(np.arange(height + 1) - 0.5, 0, height - 1) * math.pi / (height - 1)
+
+
+def sphere_grid(env: Environment, parts: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    """Midpoints (in azimuth and cosine) and solid angles of parts x parts pieces of every cell, world space."""
+    height, width = env.pixels.shape[:2]
+    cos_edges = np.cos(row_edges(height))
+    low, high = cos_edges[:-1, None], cos_edges[1:, None]
+    y = (low + (high - low) * (np.arange(parts) + 0.5) / parts).ravel()
+    phi = (np.arange(width * parts) + 0.5) / (width * parts) * 2 * math.pi
+    weight = np.repeat((cos_edges[:-1] - cos_edges[1:]) / parts, parts) * 2 * math.pi / (width * parts)
+    y, phi, weight = (g.ravel() for g in (*np.meshgrid(y, phi, indexing="ij"), np.repeat(weight, width * parts)))
+    r = np.sqrt(1 - y * y)
+    local = np.stack([r * np.sin(phi), y, -r * np.cos(phi)], axis=-1)
+    return local @ env.world_from_environment.T, weight
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_encode_and_decode_are_inverse(device):
+    axes = np.array([[0, 0, -1], [1, 0, 0], [0, 0, 1], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [3e-4, 1, 0], [0, -1, 2e-4]])
+    given = np.concatenate([axes / np.linalg.norm(axes, axis=1)[:, None], random_directions(10000)]).astype(np.float32)
+    directions = wp.array(given, dtype=wp.vec3, device=device)
+    uvs = wp.zeros(len(given), dtype=wp.vec2, device=device)
+    launch.launch(encode_decode, len(given), [directions, uvs], wp.get_device(device))
+    assert np.abs(directions.numpy() - given).max() < 2e-6
+    assert np.allclose(uvs.numpy()[:6], [[0, 0.5], [0.25, 0.5], [0.5, 0.5], [0.75, 0.5], [0, 0], [0, 1]], atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 4000])
+def test_alias_table_is_sampled_as_its_pdf_says(count):
+    rng = np.random.default_rng(count)
+    weights = rng.random(count) ** 4
+    weights[rng.random(count) < 0.2] = 0
+    weights[0] = 0.5 * count  # one item dominates
+    table = AliasTable.build(weights)
+    assert np.allclose(table.pdf, weights / weights.sum(), atol=1e-6 / count)
+    numbers = rng.random((200_000, 2), dtype=np.float32)
+    items = wp.zeros((len(numbers), 2), dtype=wp.int32, device="cpu")
+    remainders = wp.zeros((len(numbers), 2), dtype=wp.float32, device="cpu")
+    arrays = [wp.array(a, device="cpu") for a in (table.probability, table.index)]
+    inputs = [*arrays, wp.array(numbers, dtype=wp.vec2, device="cpu"), items, remainders]
+    launch.launch(choose, len(numbers), inputs, wp.get_device("cpu"))
+    for chosen, rest in zip(items.numpy().T, remainders.numpy().T, strict=True):
+        counts = np.bincount(chosen, minlength=count)
+        assert (counts[weights == 0] == 0).all()
+        assert chi_squared(counts, len(numbers) * table.pdf.astype(np.float64)) > 1e-4
+        assert rest.min() >= 0 and rest.max() < 1
+        assert chi_squared(np.histogram(rest, 50, (0, 1))[0], np.full(50, len(numbers) / 50)) > 1e-4
+
+
+def test_alias_table_refuses_bad_weights():
+    for weights in ([], [1.0, -1.0], [1.0, math.nan]):
+        with pytest.raises(ValueError, match="alias table weights"):
+            AliasTable.build(np.array(weights))
+    assert np.allclose(AliasTable.build(np.zeros(5)).pdf, 0.2)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_map_samples_follow_the_pdf_inside_every_cell(device):
+    env = Environment(pixels=spotted_map(12), rotation=37.0)
+    height, width = env.pixels.shape[:2]
+    parts, count = 3, 1_500_000
+    directions, _, _ = sample(env, count, device)
+    local = directions.astype(np.float64) @ env.world_from_environment
+    theta = np.arctan2(np.hypot(local[:, 0], local[:, 2]), local[:, 1])
+    u = np.arctan2(local[:, 0], -local[:, 2]) / (2 * math.pi) % 1
+    edges = row_edges(height)
+    row = np.clip(np.searchsorted(edges, theta) - 1, 0, height - 1)
+    up, down = np.cos(edges[row]), np.cos(edges[row + 1])
+    part = np.clip(((up - np.cos(theta)) / (up - down) * parts).astype(int), 0, parts - 1)
+    column = np.minimum((u * width * parts).astype(int), width * parts - 1)
+    counts = np.bincount((row * parts + part) * width * parts + column, minlength=height * width * parts**2)
+    points, areas = sphere_grid(env, parts)
+    _, pdf = evaluate(env, points, device)
+    expected = pdf.astype(np.float64) * areas * count
+    inside = expected > 1e-3 * expected.mean()  # float32 lets a few samples of a bright cell cross its edge
+    assert counts[~inside].sum() < 1e-5 * count
+    assert chi_squared(counts[inside], expected[inside]) > 1e-4
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_constant_sky_is_sampled_uniformly(device):
+    env = Environment.constant((1.0, 2.0, 3.0))
+    directions, radiance, pdf = sample(env, 200_000, device)
+    assert np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-6)
+    cells = np.histogram2d(directions[:, 1], np.arctan2(directions[:, 0], directions[:, 2]), 16)[0]
+    assert chi_squared(cells, np.full((16, 16), len(directions) / 256)) > 1e-4
+    assert np.allclose(pdf, 1 / (4 * math.pi)) and np.allclose(radiance, [1, 2, 3])
+    looked_up = evaluate(env, directions, device)
+    assert np.array_equal(looked_up[0], radiance) and np.array_equal(looked_up[1], pdf)
+
+
+def test_a_black_sky_yields_nothing():
+    for env in (as_environment(None), Environment.constant(0.0), Environment(pixels=np.zeros((4, 8, 3)))):
+        _, radiance, pdf = sample(env, 100)
+        assert env.is_black and not pdf.any() and not radiance.any()
+        looked_up = evaluate(env, random_directions(100))
+        assert not looked_up[0].any() and not looked_up[1].any()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("height", [2, 3, 12, 64])
+def test_pdf_integrates_to_one_and_covers_all_radiance(height, device):
+    env = Environment(pixels=spotted_map(height), rotation=-20.0, scale=2.0)
+    points, areas = sphere_grid(env)
+    radiance, pdf = evaluate(env, points, device)
+    assert abs(pdf.astype(np.float64) @ areas - 1) < 1e-4
+    assert (pdf[radiance.max(1) > 0] > 0).all()
+    assert np.allclose(radiance.T.astype(np.float64) @ areas / (4 * math.pi), env.mean_radiance, rtol=0.02)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("kind", ["map", "sun"])
+def test_sampled_flux_equals_the_integral(kind, device):
+    sky = SunSky(elevation=30.0, azimuth=77.0, height=128) if kind == "sun" else Environment(pixels=spotted_map(32))
+    env = as_environment(sky).rotated(15.0)
+    directions, radiance, pdf = sample(env, 400_000, device)
+    estimate = radiance / pdf[:, None] / (4 * math.pi)
+    error = estimate.std(0, dtype=np.float64) / math.sqrt(len(estimate))
+    assert np.all(np.abs(estimate.mean(0, dtype=np.float64) - env.mean_radiance) < 4.5 * error)
+    assert np.all(error < 0.01 * env.mean_radiance)  # a uniform choice would be off by far more
+    radiance_again, pdf_again = evaluate(env, directions, device)
+    scale = radiance.max()
+    assert np.mean(np.abs(pdf_again - pdf) > 1e-4 * pdf) < 1e-3  # at the edges of cells they may differ
+    assert np.abs(radiance_again - radiance).max() < 1e-3 * scale
+
+
+def test_rotation_turns_counter_clockwise_seen_from_above():
+    pixels = np.zeros((16, 32, 3), np.float32)
+    pixels[6:10, [31, 0]] = 1.0  # around -z
+    env = Environment(pixels=pixels)
+    axes = {"-z": [0, 0, -1], "-x": [-1, 0, 0], "+z": [0, 0, 1], "+x": [1, 0, 0]}
+    for turn, expected in ((0, "-z"), (90, "-x"), (180, "+z"), (270, "+x")):
+        radiance, _ = evaluate(env.rotated(turn), np.array(list(axes.values())))
+        assert [name for name, r in zip(axes, radiance, strict=True) if r[0] > 0.9] == [expected]
+    d = random_directions(1000)
+    turned = env.rotated(33.0)
+    assert np.allclose(evaluate(turned, d)[0], evaluate(env, d @ turned.world_from_environment)[0], atol=1e-5)
+
+
+@pytest.mark.parametrize("rotation", [0.0, 75.0])
+def test_radiance_equals_mitsuba(rotation):
+    mi = pytest.importorskip("mitsuba", reason="mitsuba is not installed (pip install mitsuba)")
+    mi.set_variant("scalar_rgb")
+    pixels = np.random.default_rng(5).random((9, 18, 3)).astype(np.float32)
+    to_world = mi.ScalarTransform4f().rotate([0, 1, 0], rotation)
+    plugin = {"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": to_world, "scale": 1.5}
+    emitter = mi.load_dict({"type": "scene", "sky": plugin, "shape": {"type": "sphere"}}).environment()
+    directions = random_directions(300)
+    expected = []
+    for d in directions:
+        interaction = mi.SurfaceInteraction3f()
+        interaction.wi = -mi.Vector3f(*d.tolist())
+        expected.append(np.array(emitter.eval(interaction)))
+    radiance, _ = evaluate(Environment(pixels=pixels, rotation=rotation, scale=1.5), directions)
+    assert np.allclose(radiance, expected, atol=2e-5)
+
+
+def test_hash_follows_what_is_seen():
+    env = Environment(pixels=spotted_map(4))
+    others = [
+        env.rotated(1),
+        Environment(pixels=env.pixels, scale=2),
+        Environment(pixels=env.pixels * 2),
+        Environment(),
+    ]
+    others += [Environment.constant(1.0), Environment.constant((1, 1, 2))]
+    assert len({e.content_hash for e in [env, *others]}) == 7
+    assert env.content_hash == Environment(pixels=spotted_map(4), rotation=360.0).content_hash
+    assert env.rotated(90).data("cpu").texels.ptr == env.data("cpu").texels.ptr  # one copy serves all rotations
+
+
+def write_image(path, pixels):
+    oiio = pytest.importorskip("OpenImageIO")
+    output = oiio.ImageOutput.create(str(path))
+    height, width, channels = pixels.shape
+    output.open(str(path), oiio.ImageSpec(width, height, channels, oiio.FLOAT))
+    output.write_image(pixels)
+    output.close()
+
+
+@pytest.mark.parametrize("suffix", ["exr", "hdr"])
+def test_load_reads_what_was_written(tmp_path, suffix):
+    pixels = spotted_map(8)
+    write_image(tmp_path / f"sky.{suffix}", pixels)
+    env = as_environment(str(tmp_path / f"sky.{suffix}"))
+    assert np.allclose(env.pixels, pixels, rtol=0.01, atol=0.02 if suffix == "hdr" else 1e-6)
+
+
+def test_load_refuses_what_cannot_be_a_sky(tmp_path):
+    good = spotted_map(32)
+    nan, wide = good.copy(), np.ones((8, 20, 3), np.float32)
+    nan[3, 4, 1] = math.nan
+    for name, pixels in (("good", good), ("nan", nan), ("wide", wide)):
+        write_image(tmp_path / f"{name}.exr", pixels)
+    (tmp_path / "cut.exr").write_bytes((tmp_path / "good.exr").read_bytes()[:4000])
+    (tmp_path / "empty.exr").write_bytes(b"")
+    (tmp_path / "text.exr").write_text("no image")
+    for name, message in (
+        ("missing", "no such file"),
+        ("cut", "damaged or cut short"),
+        ("empty", "empty"),
+        ("text", "not an image"),
+        ("nan", "1 pixels are NaN"),
+        ("wide", "twice as wide as high.*20x8"),
+    ):
+        with pytest.raises(SceneError, match=message) as caught:
+            Environment.load(tmp_path / f"{name}.exr")
+        assert "\n" not in str(caught.value) and f"{name}.exr" in str(caught.value)
+
+
+def test_negative_pixels_become_zero_with_a_warning(tmp_path):
+    pixels = spotted_map(4)
+    pixels[1, 1] = -0.25
+    write_image(tmp_path / "ringing.exr", pixels)
+    with pytest.warns(UserWarning, match="1 pixels are negative"):
+        env = Environment.load(tmp_path / "ringing.exr")
+    assert np.array_equal(env.pixels, np.maximum(pixels, 0))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Environment.constant((1, 2)),
+        lambda: Environment.constant((1, -1, 0)),
+        lambda: Environment.constant((1, math.nan, 0)),
+        lambda: as_environment(object()),
+        lambda: Environment(pixels=np.ones((4, 8, 3)), color=(1, 1, 1)),
+        lambda: Environment(pixels=np.ones((0, 0, 3))),
+        lambda: Environment(pixels=-np.ones((4, 8, 3))),
+        lambda: Environment(pixels=np.ones((4, 8))),
+        lambda: Environment(scale=-1.0),
+        lambda: Environment(rotation=math.inf),
+    ],
+)
+def test_bad_settings_are_one_line_errors(make):
+    with pytest.raises(SceneError) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("elevation", [2.0, 30.0, 90.0])
+def test_the_map_holds_all_of_the_sun_in_its_place(elevation):
+    sky = SunSky(elevation=elevation, azimuth=123.0, height=256)
+    sun = sky.pixels() - replace(sky, sun_intensity=0.0).pixels()
+    sun[128:] = 0  # the ground is lit by the sun as well
+    env = Environment(pixels=np.maximum(sun, 0))
+    assert np.allclose(env.mean_radiance * 4 * math.pi, sky.sun_irradiance, rtol=1e-3)
+    points, areas = sphere_grid(env, 3)
+    radiance, _ = evaluate(env, points)
+    centre = (radiance[:, 1] * areas) @ points
+    assert np.linalg.norm(centre / np.linalg.norm(centre) - sky.direction) < math.radians(0.1)
+
+
+def test_the_sky_is_physically_plausible():
+    sky = SunSky(elevation=60.0, turbidity=2.5, intensity=1.0)
+    illuminance = sky.sun_irradiance @ [0.2126, 0.7152, 0.0722] * 179
+    assert 80_000 < illuminance < 120_000  # lx, a clear day
+    low = SunSky(elevation=5.0).sun_irradiance
+    assert low[0] > 2 * low[2]  # red at dusk
+    pixels = SunSky(sun_intensity=0).pixels()
+    assert pixels.min() >= 0 and np.isfinite(pixels).all()
+    assert pixels[0, 0, 2] > 1.5 * pixels[0, 0, 0]  # blue zenith
+    assert np.allclose(pixels, pixels[:, ::-1], rtol=1e-4)  # the sun at azimuth 0 is on the plane of symmetry
+
+
+def test_sun_sky_settings():
+    sky = SunSky.towards((1.0, 1.0, 0.0), turbidity=4.0)
+    assert sky.azimuth == pytest.approx(90) and sky.elevation == pytest.approx(45) and sky.turbidity == 4.0
+    assert np.allclose(sky.direction, [math.sqrt(0.5), math.sqrt(0.5), 0])
+    for settings in ({"elevation": -5.0}, {"turbidity": 50.0}, {"height": 3}, {"ground_albedo": (2, 0, 0)}):
+        with pytest.raises(OptionError, match=next(iter(settings))):
+            SunSky(**settings)
+    with pytest.raises(OptionError, match="above the horizon"):
+        SunSky.towards((0, -1, 0))
