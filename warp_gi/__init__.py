@@ -32,7 +32,7 @@ _PUBLIC = {
     "Camera": "warp_gi.camera",
     "CameraPath": "warp_gi.camera",
     "Pipeline": "warp_gi.pipeline",
-    "Estimator": "warp_gi.pipeline",
+    "Estimator": "warp_gi.estimator",
     "TracedEnvironment": "warp_gi.techniques.baselines",
     "UniformLights": "warp_gi.techniques.baselines",
     "PowerLights": "warp_gi.techniques.baselines",

@@ -83,7 +83,7 @@ class Camera:
         width, height = self.resolution
         scale = 0.5 * width / math.tan(math.radians(self.hfov) / 2)
         xy = local[:, :2] / -local[:, 2:] * [scale, -scale]
-        return xy + [0.5 * width, 0.5 * height]
+        return xy + np.array([0.5 * width, 0.5 * height])
 
 
 def _look_at_matrix(eye: Sequence[float], target: Sequence[float], up: Sequence[float]) -> np.ndarray:
@@ -140,7 +140,7 @@ class CameraPath:
     @property
     def frame_count(self) -> int:
         """Number of frames from time 0 to the last key, both included."""
-        return int(math.floor(self.keys[-1].time * self.fps + 1e-6)) + 1
+        return math.floor(self.keys[-1].time * self.fps + 1e-6) + 1
 
     def camera(self, frame: int) -> Camera:
         """Return the camera of a frame."""
@@ -162,7 +162,9 @@ class CameraPath:
         return cls.from_cameras([camera])
 
     @classmethod
-    def from_cameras(cls, cameras: Iterable[Camera], times: Iterable[float] | None = None, fps: float = 24.0) -> CameraPath:
+    def from_cameras(
+        cls, cameras: Iterable[Camera], times: Iterable[float] | None = None, fps: float = 24.0
+    ) -> CameraPath:
         """Return a path through ``cameras``, at ``times`` in seconds or one a frame."""
         cameras = list(cameras)
         times = [i / fps for i in range(len(cameras))] if times is None else list(times)
@@ -186,7 +188,7 @@ class CameraPath:
         fps: float = 24.0,
     ) -> CameraPath:
         """Return a path that circles ``center`` at ``radius`` and ``height`` above it [m], looking at it."""
-        count = max(2, int(math.ceil(abs(turns) * 24)) + 1)
+        count = max(2, math.ceil(abs(turns) * 24) + 1)
         cx, cy, cz = center
         keys = []
         for i in range(count):

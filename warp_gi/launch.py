@@ -137,7 +137,9 @@ def _mismatch(expected: object, value: object, device: wp.Device) -> str | None:
             return None
         if not isinstance(value, wp.array):
             return f"expected a wp.array, got {type(value).__name__}"
-        if value.dtype is not expected.dtype and getattr(value.dtype, "cls", 0) is not getattr(expected.dtype, "cls", 1):
+        if value.dtype is not expected.dtype and getattr(value.dtype, "cls", 0) is not getattr(
+            expected.dtype, "cls", 1
+        ):
             return f"expected dtype {expected.dtype}, got {value.dtype}"
         if value.ndim != expected.ndim:
             return f"expected {expected.ndim} dimensions, got {value.ndim}"

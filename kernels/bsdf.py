@@ -1,0 +1,148 @@
+"""The glTF 2.0 metallic-roughness BSDF: Lambert under a GGX coat, or GGX metal.
+
+glTF 2.0 Appendix B with KHR_materials_specular: D is GGX, V the height-correlated
+Smith visibility, F Schlick's,
+
+    f = (1 - F) c_diffuse / pi + F D V,   F = f0 + (f90 - f0) (1 - V.H)^5
+
+Directions point away from the surface, in the shading frame (z is the normal).
+Diffuse lobes are sampled by cosine, GGX by visible normals (Dupuy and Benyoub 2023,
+"Sampling Visible GGX Normals with Spherical Caps").
+"""
+
+import warp as wp
+from warp_gi.kernels.sampling import cosine_direction
+
+wp.set_module_options({"enable_backward": False})
+
+SMALLEST_ALPHA = wp.constant(wp.float32(1.0e-3))
+
+
+# What a material is at one point. f0 and f90 are zero for pure Lambert.
+@wp.struct
+class Bsdf:
+    diffuse: wp.vec3  # c_diffuse
+    f0: wp.vec3
+    f90: wp.float32
+    alpha: wp.float32
+
+
+# f * cos(wi) [1/sr] and the solid-angle pdf of bsdf_sample.
+@wp.struct
+class BsdfValue:
+    value: wp.vec3
+    pdf: wp.float32
+
+
+# weight = f * cos(wi) / pdf; pdf is 0 where sampling failed.
+@wp.struct
+class BsdfSample:
+    wi: wp.vec3
+    weight: wp.vec3
+    pdf: wp.float32
+
+
+@wp.func
+def make_bsdf(base: wp.vec3, metallic: wp.float32, roughness: wp.float32, specular: wp.float32) -> Bsdf:
+    b = Bsdf()
+    b.diffuse = base * (1.0 - metallic)
+    dielectric = 0.04 * specular * (1.0 - metallic)
+    b.f0 = wp.vec3(dielectric, dielectric, dielectric) + base * metallic
+    b.f90 = specular * (1.0 - metallic) + metallic
+    b.alpha = wp.max(roughness * roughness, SMALLEST_ALPHA)
+    return b
+
+
+@wp.func
+def luminance(c: wp.vec3) -> wp.float32:
+    return 0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2]
+
+
+@wp.func
+def fresnel(b: Bsdf, cos_h: wp.float32) -> wp.vec3:
+    m = wp.clamp(1.0 - cos_h, 0.0, 1.0)
+    m2 = m * m
+    s = m2 * m2 * m
+    return b.f0 * (1.0 - s) + wp.vec3(b.f90 * s, b.f90 * s, b.f90 * s)
+
+
+# Probability of sampling the GGX lobe: its share of the reflectance, looking from wo.
+@wp.func
+def specular_probability(b: Bsdf, cos_o: wp.float32) -> wp.float32:
+    if b.f90 <= 0.0:
+        return 0.0
+    f = luminance(fresnel(b, cos_o))
+    d = luminance(b.diffuse) * (1.0 - f)
+    if d <= 0.0:
+        return 1.0
+    return wp.clamp(f / (f + d), 0.05, 1.0)
+
+
+@wp.func
+def ggx_distribution(alpha: wp.float32, cos_h: wp.float32, sin2_h: wp.float32) -> wp.float32:
+    # sin2_h is passed in: 1 - cos^2 loses all digits near the peak of a smooth lobe
+    a2 = alpha * alpha
+    d = sin2_h + a2 * cos_h * cos_h
+    return a2 / (wp.pi * d * d)
+
+
+@wp.func
+def smith_root(alpha: wp.float32, cos_theta: wp.float32) -> wp.float32:
+    a2 = alpha * alpha
+    return wp.sqrt(a2 + (1.0 - a2) * cos_theta * cos_theta)
+
+
+@wp.func
+def bsdf_evaluate(b: Bsdf, wo: wp.vec3, wi: wp.vec3) -> BsdfValue:
+    r = BsdfValue()
+    cos_o = wo[2]
+    cos_i = wi[2]
+    if cos_o <= 0.0 or cos_i <= 0.0:
+        return r
+    if b.f90 <= 0.0:
+        r.pdf = cos_i / wp.pi
+        r.value = b.diffuse * r.pdf
+        return r
+    h = wp.normalize(wo + wi)
+    f = fresnel(b, wp.dot(wo, h))
+    d = ggx_distribution(b.alpha, h[2], h[0] * h[0] + h[1] * h[1])
+    root_o = smith_root(b.alpha, cos_o)
+    visibility = 0.5 / (cos_o * smith_root(b.alpha, cos_i) + cos_i * root_o)
+    r.value = (wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - f, b.diffuse) / wp.pi + f * (d * visibility)) * cos_i
+    p = specular_probability(b, cos_o)
+    r.pdf = p * d / (2.0 * (cos_o + root_o)) + (1.0 - p) * cos_i / wp.pi
+    return r
+
+
+# Visible normal of GGX seen from wo.
+@wp.func
+def ggx_visible_normal(alpha: wp.float32, wo: wp.vec3, u: wp.vec2) -> wp.vec3:
+    w = wp.normalize(wp.vec3(alpha * wo[0], alpha * wo[1], wo[2]))
+    z = (1.0 - u[1]) * (1.0 + w[2]) - w[2]
+    s = wp.sqrt(wp.clamp(1.0 - z * z, 0.0, 1.0))
+    angle = 2.0 * wp.pi * u[0]
+    h = wp.vec3(s * wp.cos(angle), s * wp.sin(angle), z) + w
+    return wp.normalize(wp.vec3(alpha * h[0], alpha * h[1], wp.max(h[2], 1.0e-6)))
+
+
+# u_lobe chooses the lobe, u the direction in it.
+@wp.func
+def bsdf_sample(b: Bsdf, wo: wp.vec3, u_lobe: wp.float32, u: wp.vec2) -> BsdfSample:
+    r = BsdfSample()
+    if wo[2] <= 0.0:
+        return r
+    if b.f90 <= 0.0:
+        r.wi = cosine_direction(u)
+        r.pdf = r.wi[2] / wp.pi
+        r.weight = b.diffuse
+        return r
+    if u_lobe < specular_probability(b, wo[2]):
+        h = ggx_visible_normal(b.alpha, wo, u)
+        r.wi = h * (2.0 * wp.dot(wo, h)) - wo
+    else:
+        r.wi = cosine_direction(u)
+    value = bsdf_evaluate(b, wo, r.wi)
+    if value.pdf > 0.0:
+        r.pdf = value.pdf
+        r.weight = value.value / value.pdf
+    return r

@@ -1,0 +1,43 @@
+"""The end of a frame: sums become means, and terms add up to beauty."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+# [height * width]; sums on entry, means on exit.
+@wp.struct
+class FrameSums:
+    emission: wp.array(dtype=wp.vec3)
+    environment: wp.array(dtype=wp.vec3)
+    emitters: wp.array(dtype=wp.vec3)
+    indirect: wp.array(dtype=wp.vec3)
+    albedo: wp.array(dtype=wp.vec3)
+    normal: wp.array(dtype=wp.vec3)
+    moment1: wp.array(dtype=wp.vec3)
+    moment2: wp.array(dtype=wp.vec3)
+    beauty: wp.array(dtype=wp.vec3)
+    variance: wp.array(dtype=wp.vec3)  # of the mean
+
+
+# Thread: a pixel. beauty = ((emission + environment) + emitters) + indirect, to the last bit.
+# variance = (E[x^2] - E[x]^2) / (n - 1), which overestimates for stratified samples.
+@wp.kernel
+def compose_frame(first: wp.int32, camera_samples: wp.int32, samples: wp.int32, b: FrameSums):
+    i = first + wp.tid()
+    views = wp.float32(camera_samples)
+    n = wp.float32(samples)
+    emission = b.emission[i] / views
+    environment = b.environment[i] / n
+    emitters = b.emitters[i] / n
+    indirect = b.indirect[i] / n
+    b.emission[i] = emission
+    b.environment[i] = environment
+    b.emitters[i] = emitters
+    b.indirect[i] = indirect
+    b.albedo[i] = b.albedo[i] / views
+    b.normal[i] = b.normal[i] / views
+    b.beauty[i] = emission + environment + emitters + indirect
+    mean = b.moment1[i] / n
+    if samples > 1:
+        b.variance[i] = wp.max(b.moment2[i] / n - wp.cw_mul(mean, mean), wp.vec3(0.0, 0.0, 0.0)) / (n - 1.0)

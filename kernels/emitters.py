@@ -1,0 +1,102 @@
+"""Direct light from emissive triangles and punctual lights, selected by an alias table."""
+
+import warp as wp
+from warp_gi.kernels.alias import alias_choice_small
+from warp_gi.kernels.sampling import triangle_barycentrics
+from warp_gi.kernels.surface import emitted_radiance
+from warp_gi.kernels.types import (
+    EMITTER_DIRECTIONAL,
+    EMITTER_SPOT,
+    EMITTER_TRIANGLE,
+    SceneData,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+INFINITE_DISTANCE = wp.constant(wp.float32(1.0e30))
+
+
+# radiance is over pdf already for lights without size (delta = 1), whose pdf is the
+# probability of selecting them; else pdf is per solid angle. pdf 0: no sample.
+@wp.struct
+class LightSample:
+    direction: wp.vec3  # unit, towards the light
+    distance: wp.float32
+    radiance: wp.vec3
+    pdf: wp.float32
+    delta: wp.int32
+
+
+# Solid-angle pdf of one strategy that picks this emissive triangle and a point uniform on it.
+@wp.func
+def triangle_light_pdf(
+    scene: SceneData, emitter: wp.int32, face: wp.int32, direction: wp.vec3, distance: wp.float32
+) -> wp.float32:
+    ids = scene.geometry.indices[face]
+    p0 = scene.geometry.points[ids[0]]
+    normal = wp.cross(scene.geometry.points[ids[1]] - p0, scene.geometry.points[ids[2]] - p0)
+    # |normal| is twice the area, so |n . d| / 2 is area times cosine
+    projected = 0.5 * wp.abs(wp.dot(normal, direction))
+    if projected <= 0.0:
+        return 0.0
+    return scene.emitters.pdf[emitter] * distance * distance / projected
+
+
+# Falloff of KHR_lights_punctual: inverse square, ended smoothly at `range`.
+@wp.func
+def distance_falloff(distance: wp.float32, range: wp.float32) -> wp.float32:
+    falloff = 1.0 / (distance * distance)
+    if range > 0.0:
+        r = distance / range
+        falloff = falloff * wp.clamp(1.0 - r * r * r * r, 0.0, 1.0)
+    return falloff
+
+
+# One sample of one emitter, as seen from `position`.
+@wp.func
+def sample_emitter(scene: SceneData, position: wp.vec3, u_select: wp.float32, u: wp.vec2) -> LightSample:
+    r = LightSample()
+    e = scene.emitters
+    if e.count == 0:
+        return r
+    index = alias_choice_small(e.alias_probability, e.alias_index, e.count, u_select).item
+    light = e.emitters[index]
+    if light.kind == EMITTER_TRIANGLE:
+        b = triangle_barycentrics(u)
+        ids = scene.geometry.indices[light.triangle]
+        p0 = scene.geometry.points[ids[0]]
+        p1 = scene.geometry.points[ids[1]]
+        p2 = scene.geometry.points[ids[2]]
+        to_light = p0 * (1.0 - b[0] - b[1]) + p1 * b[0] + p2 * b[1] - position
+        r.distance = wp.length(to_light)
+        if r.distance <= 0.0:
+            return r
+        r.direction = to_light / r.distance
+        material = scene.materials[scene.geometry.materials[light.triangle]]
+        if material.double_sided == 0 and wp.dot(wp.cross(p1 - p0, p2 - p0), r.direction) >= 0.0:
+            return r
+        r.pdf = triangle_light_pdf(scene, index, light.triangle, r.direction, r.distance)
+        r.radiance = emitted_radiance(scene, light.triangle, b[0], b[1])
+        return r
+    r.delta = 1
+    r.pdf = e.pdf[index]
+    if light.kind == EMITTER_DIRECTIONAL:
+        r.direction = -light.direction
+        r.distance = INFINITE_DISTANCE
+        r.radiance = light.intensity / r.pdf
+        return r
+    to_light = light.position - position
+    r.distance = wp.length(to_light)
+    if r.distance <= 0.0:
+        r.pdf = 0.0
+        return r
+    r.direction = to_light / r.distance
+    strength = distance_falloff(r.distance, light.range)
+    if light.kind == EMITTER_SPOT:
+        cone = (-wp.dot(r.direction, light.direction) - light.cos_outer) / wp.max(
+            light.cos_inner - light.cos_outer, 1.0e-4
+        )
+        cone = wp.clamp(cone, 0.0, 1.0)
+        strength = strength * cone * cone
+    r.radiance = light.intensity * (strength / r.pdf)
+    return r

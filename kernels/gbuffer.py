@@ -1,0 +1,154 @@
+"""Primary visibility: camera rays, first hits, and the buffers read off them."""
+
+import warp as wp
+from warp_gi.kernels.bvh import bvh_intersect
+from warp_gi.kernels.environment import environment_radiance
+from warp_gi.kernels.sampling import filter_offset, pixel_sample_index, pixel_seed, sample_2d
+from warp_gi.kernels.surface import surface_at
+from warp_gi.kernels.types import SceneData
+
+wp.set_module_options({"enable_backward": False})
+
+TILE = 8  # pixels; items run through square tiles, so that neighbours in time are neighbours in the picture
+
+
+# `right` and `up` are scaled so that forward + x right + y up with x, y in [-1, 1] spans the picture.
+@wp.struct
+class CameraData:
+    position: wp.vec3
+    right: wp.vec3
+    up: wp.vec3
+    forward: wp.vec3
+    width: wp.int32
+    height: wp.int32
+
+
+# One camera sample of every pixel, [height * width] in rows from the top.
+@wp.struct
+class PrimaryHits:
+    direction: wp.array(dtype=wp.vec3)  # unit
+    t: wp.array(dtype=wp.float32)
+    u: wp.array(dtype=wp.float32)
+    v: wp.array(dtype=wp.float32)
+    face: wp.array(dtype=wp.int32)  # -1 on a miss
+
+
+# Which samples a pass draws.
+@wp.struct
+class PassSettings:
+    seed: wp.uint32  # of the frame
+    camera_sample: wp.int32
+    camera_samples: wp.int32
+    camera_bits: wp.int32  # ceil(log2(camera_samples))
+    first_sample: wp.int32  # samples [first_sample, first_sample + sample_count) of each pixel
+    sample_count: wp.int32
+    sample_bits: wp.int32  # ceil(log2(spp))
+    tent: wp.int32  # 1: tent filter, 0: box
+
+
+# Running sums over camera samples, [height * width].
+@wp.struct
+class SurfaceBuffers:
+    emission: wp.array(dtype=wp.vec3)
+    albedo: wp.array(dtype=wp.vec3)
+    normal: wp.array(dtype=wp.vec3)
+    position: wp.array(dtype=wp.vec3)  # this and the following: of the first camera sample
+    depth: wp.array(dtype=wp.float32)
+    motion: wp.array(dtype=wp.vec2)
+    object_id: wp.array(dtype=wp.int32)
+    material_id: wp.array(dtype=wp.int32)
+
+
+# Pixel of an item, in tiles; y may lie outside the picture.
+@wp.func
+def tiled_pixel(item: wp.int32, width: wp.int32) -> wp.vec2i:
+    per_row = (width + TILE - 1) / TILE
+    tile = item / (TILE * TILE)
+    inside = item - tile * (TILE * TILE)
+    row = tile / per_row
+    y = inside / TILE
+    return wp.vec2i((tile - row * per_row) * TILE + inside - y * TILE, row * TILE + y)
+
+
+@wp.func
+def camera_ray(camera: CameraData, x: wp.float32, y: wp.float32) -> wp.vec3:
+    sx = 2.0 * x / wp.float32(camera.width) - 1.0
+    sy = 1.0 - 2.0 * y / wp.float32(camera.height)
+    return wp.normalize(camera.forward + camera.right * sx + camera.up * sy)
+
+
+# Pixel coordinates of a direction from the camera; inverse of camera_ray.
+@wp.func
+def project(camera: CameraData, direction: wp.vec3) -> wp.vec2:
+    z = wp.max(wp.dot(direction, camera.forward), 1.0e-9)
+    x = wp.dot(direction, camera.right) / (wp.length_sq(camera.right) * z)
+    y = wp.dot(direction, camera.up) / (wp.length_sq(camera.up) * z)
+    return wp.vec2(0.5 * (x + 1.0) * wp.float32(camera.width), 0.5 * (1.0 - y) * wp.float32(camera.height))
+
+
+# Thread: a pixel. Traces one camera ray; jitters it unless there is only one camera sample.
+@wp.kernel
+def trace_primary(first: wp.int32, scene: SceneData, camera: CameraData, settings: PassSettings, hits: PrimaryHits):
+    p = tiled_pixel(first + wp.tid(), camera.width)
+    if p[0] >= camera.width or p[1] >= camera.height:
+        return
+    offset = wp.vec2(0.0, 0.0)
+    if settings.camera_samples > 1:
+        index = pixel_sample_index(p[0], p[1], settings.camera_sample, settings.camera_bits)
+        seed = pixel_seed(p[0], p[1], settings.camera_bits, settings.seed)
+        u = sample_2d(index, seed, 0)
+        offset = wp.vec2(filter_offset(settings.tent, u[0]), filter_offset(settings.tent, u[1]))
+    direction = camera_ray(camera, wp.float32(p[0]) + 0.5 + offset[0], wp.float32(p[1]) + 0.5 + offset[1])
+    hit = bvh_intersect(scene.bvh, camera.position, direction, float(wp.inf))
+    pixel = p[1] * camera.width + p[0]
+    hits.direction[pixel] = direction
+    hits.t[pixel] = hit.t
+    hits.u[pixel] = hit.u
+    hits.v[pixel] = hit.v
+    hits.face[pixel] = hit.face
+
+
+# Thread: a pixel. Adds what the first hit shows: emission, albedo, normal; the first camera
+# sample sets position, depth (along the view axis, inf on a miss), ids, and motion: where the
+# point was in the previous frame, minus where it is now, in pixels, x right and y down.
+@wp.kernel
+def shade_primary(
+    first: wp.int32,
+    scene: SceneData,
+    camera: CameraData,
+    previous_camera: CameraData,
+    settings: PassSettings,
+    hits: PrimaryHits,
+    buffers: SurfaceBuffers,
+):
+    pixel = first + wp.tid()
+    direction = hits.direction[pixel]
+    face = hits.face[pixel]
+    u = hits.u[pixel]
+    v = hits.v[pixel]
+    was = direction
+    position = wp.vec3(0.0, 0.0, 0.0)
+    depth = float(wp.inf)
+    object_id = int(-1)
+    material_id = int(-1)
+    if face < 0:
+        buffers.emission[pixel] = buffers.emission[pixel] + environment_radiance(scene.environment, direction)
+    else:
+        s = surface_at(scene, face, u, v, -direction)
+        buffers.emission[pixel] = buffers.emission[pixel] + s.emission
+        buffers.albedo[pixel] = buffers.albedo[pixel] + s.base_color
+        buffers.normal[pixel] = buffers.normal[pixel] + wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
+        if settings.camera_sample == 0:
+            ids = scene.geometry.indices[face]
+            old = scene.geometry.previous_points
+            was = old[ids[0]] * (1.0 - u - v) + old[ids[1]] * u + old[ids[2]] * v - previous_camera.position
+            position = s.position
+            depth = wp.dot(position - camera.position, camera.forward)
+            object_id = scene.geometry.objects[face]
+            material_id = scene.geometry.materials[face]
+    if settings.camera_sample == 0:
+        buffers.position[pixel] = position
+        buffers.depth[pixel] = depth
+        buffers.object_id[pixel] = object_id
+        buffers.material_id[pixel] = material_id
+        buffers.motion[pixel] = project(previous_camera, was) - project(camera, direction)

@@ -1,0 +1,149 @@
+"""Random numbers, warps of the unit square, frames.
+
+Samples come from the first two Sobol dimensions, shuffled and scrambled by hashes
+(Burley 2020, "Practical Hash-based Owen Scrambling"; constants by Vegdahl), one
+independent shuffle for each dimension pair. The sequence runs along the Morton
+curve of the pixels, so that every aligned power-of-two block of pixels and samples
+is itself a (0, 2)-net and the error is blue noise over the picture (Ahmed and Wonka
+2020, "Screen-Space Blue-Noise Diffusion of Monte Carlo Sampling Error via
+Hierarchical Ordering of Pixels"). A number depends on the seed (which holds the
+frame), the pixel, the sample and the dimension only.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+_INTEGER_CODE = """
+struct Bits {
+    static CUDA_CALLABLE inline uint32 reverse(uint32 x) {
+        x = ((x >> 1) & 0x55555555u) | ((x & 0x55555555u) << 1);
+        x = ((x >> 2) & 0x33333333u) | ((x & 0x33333333u) << 2);
+        x = ((x >> 4) & 0x0f0f0f0fu) | ((x & 0x0f0f0f0fu) << 4);
+        x = ((x >> 8) & 0x00ff00ffu) | ((x & 0x00ff00ffu) << 8);
+        return (x >> 16) | (x << 16);
+    }
+    static CUDA_CALLABLE inline uint32 hash(uint32 x) {
+        x ^= x >> 16; x *= 0x21f0aaadu; x ^= x >> 15; x *= 0x735a2d97u; x ^= x >> 15;
+        return x;
+    }
+    // Laine-Karras permutation: flips each bit by a hash of the bits below it.
+    static CUDA_CALLABLE inline uint32 scramble(uint32 x, uint32 seed) {
+        x ^= x * 0x3d20adeau; x += seed; x *= (seed >> 16) | 1u;
+        x ^= x * 0x05526c56u; x ^= x * 0x53a22864u;
+        return x;
+    }
+    // Second Sobol dimension, bit-reversed: the Pascal matrix modulo 2 in five steps.
+    static CUDA_CALLABLE inline uint32 pascal(uint32 x) {
+        x ^= (x >> 16); x ^= (x & 0xff00ff00u) >> 8; x ^= (x & 0xf0f0f0f0u) >> 4;
+        x ^= (x & 0xccccccccu) >> 2; x ^= (x & 0xaaaaaaaau) >> 1;
+        return x;
+    }
+    static CUDA_CALLABLE inline float unit(uint32 x) { return float(x >> 8) * 5.9604644775390625e-8f; }
+};
+"""
+
+
+# A well-mixed 32-bit hash (lowbias32 by Wellons).
+@wp.func_native(snippet=_INTEGER_CODE + "return Bits::hash(value);")
+def hash_uint(value: wp.uint32) -> wp.uint32: ...
+
+
+# Morton code of a pixel: x in the even bits, y in the odd bits.
+@wp.func_native(
+    snippet="""
+    uint32 code = 0;
+    for (int i = 0; i < 16; ++i)
+        code |= ((uint32(x) >> i) & 1u) << (2 * i) | ((uint32(y) >> i) & 1u) << (2 * i + 1);
+    return code;
+"""
+)
+def morton_code(x: wp.int32, y: wp.int32) -> wp.uint32: ...
+
+
+# Point of one dimension pair in [0, 1)^2: `index` counts samples along the Morton
+# curve of the pixels (pixel_sample_index), `dimension` names the pair.
+@wp.func_native(
+    snippet=_INTEGER_CODE
+    + """
+    const uint32 key = Bits::hash(seed ^ Bits::hash(uint32(dimension) + 0x9e3779b9u));
+    const uint32 i = Bits::reverse(Bits::scramble(Bits::reverse(index), key));
+    const uint32 a = Bits::reverse(Bits::scramble(i, Bits::hash(key + 1u)));
+    const uint32 b = Bits::reverse(Bits::scramble(Bits::pascal(i), Bits::hash(key + 2u)));
+    return wp::vec_t<2, float>(Bits::unit(a), Bits::unit(b));
+"""
+)
+def sample_2d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32) -> wp.vec2: ...
+
+
+# Number of one dimension in [0, 1).
+@wp.func_native(
+    snippet=_INTEGER_CODE
+    + """
+    const uint32 key = Bits::hash(seed ^ Bits::hash(uint32(dimension) + 0x9e3779b9u));
+    const uint32 i = Bits::reverse(Bits::scramble(Bits::reverse(index), key));
+    return Bits::unit(Bits::reverse(Bits::scramble(i, Bits::hash(key + 1u))));
+"""
+)
+def sample_1d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32) -> wp.float32: ...
+
+
+# Index in the sequence of sample `sample` of a pixel with 2^sample_bits samples reserved.
+# Pixels 2^((32 - sample_bits) / 2) apart share indices; `pixel_seed` tells them apart.
+@wp.func
+def pixel_sample_index(x: wp.int32, y: wp.int32, sample: wp.int32, sample_bits: wp.int32) -> wp.uint32:
+    return (morton_code(x, y) << wp.uint32(sample_bits)) + wp.uint32(sample)
+
+
+@wp.func
+def pixel_seed(x: wp.int32, y: wp.int32, sample_bits: wp.int32, seed: wp.uint32) -> wp.uint32:
+    if sample_bits == 0:
+        return seed
+    overflow = morton_code(x, y) >> wp.uint32(32 - sample_bits)
+    if overflow == wp.uint32(0):
+        return seed
+    return hash_uint(seed + overflow)
+
+
+# Cosine-weighted direction about +z (Malley's method); pdf = z / pi.
+@wp.func
+def cosine_direction(u: wp.vec2) -> wp.vec3:
+    radius = wp.sqrt(u[0])
+    angle = 2.0 * wp.pi * u[1]
+    return wp.vec3(radius * wp.cos(angle), radius * wp.sin(angle), wp.sqrt(wp.max(0.0, 1.0 - u[0])))
+
+
+# Barycentric weights of the second and third corner, uniform over the triangle.
+@wp.func
+def triangle_barycentrics(u: wp.vec2) -> wp.vec2:
+    root = wp.sqrt(u[0])
+    return wp.vec2(root * (1.0 - u[1]), root * u[1])
+
+
+# Offset in pixels from the centre: a box filter is uniform in [-0.5, 0.5), a tent has radius 1.
+@wp.func
+def filter_offset(tent: wp.int32, u: wp.float32) -> wp.float32:
+    if tent == 0:
+        return u - 0.5
+    if u < 0.5:
+        return wp.sqrt(2.0 * u) - 1.0
+    return 1.0 - wp.sqrt(2.0 * (1.0 - u))
+
+
+# Rotation whose third column is the unit vector n (Duff et al. 2017).
+@wp.func
+def frame_of(n: wp.vec3) -> wp.mat33:
+    sign = float(1.0)
+    if n[2] < 0.0:
+        sign = -1.0
+    a = -1.0 / (sign + n[2])
+    b = n[0] * n[1] * a
+    s = wp.vec3(1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0])
+    t = wp.vec3(b, sign + n[1] * n[1] * a, -n[1])
+    return wp.matrix_from_cols(s, t, n)
+
+
+# Balance heuristic for one sample of each of two strategies.
+@wp.func
+def balance(pdf: wp.float32, other_pdf: wp.float32) -> wp.float32:
+    return pdf / (pdf + other_pdf)

@@ -1,0 +1,184 @@
+"""From a hit to a point with normals, texture coordinates, BSDF and emission."""
+
+import warp as wp
+from warp_gi.kernels.bsdf import Bsdf, make_bsdf
+from warp_gi.kernels.sampling import frame_of
+from warp_gi.kernels.types import WRAP_CLAMP, WRAP_MIRROR, SceneData
+
+wp.set_module_options({"enable_backward": False})
+
+WRAP_CLAMP_ = wp.constant(WRAP_CLAMP)
+WRAP_MIRROR_ = wp.constant(WRAP_MIRROR)
+
+
+# A point on a surface, seen from the side of `wo`.
+@wp.struct
+class Surface:
+    position: wp.vec3
+    normal: wp.vec3  # geometric, unit, on the side of wo
+    shading: wp.mat33  # world_from_shading; its third column is the shading normal
+    bsdf: Bsdf
+    base_color: wp.vec3
+    emission: wp.vec3  # towards wo
+    offset: wp.float32  # metres by which rays leave along `normal`
+
+
+@wp.func
+def wrap_index(i: wp.int32, size: wp.int32, mode: wp.int32) -> wp.int32:
+    if mode == WRAP_CLAMP_:
+        return wp.clamp(i, 0, size - 1)
+    if mode == WRAP_MIRROR_:
+        k = i % (2 * size)
+        if k < 0:
+            k += 2 * size
+        return wp.min(k, 2 * size - 1 - k)
+    k = i % size
+    if k < 0:
+        k += size
+    return k
+
+
+@wp.func
+def texel_color(scene: SceneData, index: wp.int32, srgb: wp.int32) -> wp.vec4:
+    word = scene.texels[index]
+    r = wp.int32(word & wp.uint32(255))
+    g = wp.int32((word >> wp.uint32(8)) & wp.uint32(255))
+    b = wp.int32((word >> wp.uint32(16)) & wp.uint32(255))
+    a = wp.float32(word >> wp.uint32(24)) / 255.0
+    if srgb != 0:
+        return wp.vec4(scene.srgb_to_linear[r], scene.srgb_to_linear[g], scene.srgb_to_linear[b], a)
+    return wp.vec4(wp.float32(r), wp.float32(g), wp.float32(b), a * 255.0) / 255.0
+
+
+# Bilinear lookup, colours linear.
+@wp.func
+def texture_lookup(scene: SceneData, texture: wp.int32, uv: wp.vec2) -> wp.vec4:
+    t = scene.textures[texture]
+    # fract first: large repeats would lose the fraction in float32 anyway, and int32 must not overflow
+    x = uv[0] * wp.float32(t.width) - 0.5
+    y = uv[1] * wp.float32(t.height) - 0.5
+    x = wp.clamp(x, -1.0e9, 1.0e9)
+    y = wp.clamp(y, -1.0e9, 1.0e9)
+    fx = x - wp.floor(x)
+    fy = y - wp.floor(y)
+    i = wp.int32(wp.floor(x))
+    j = wp.int32(wp.floor(y))
+    i0 = wrap_index(i, t.width, t.wrap_u)
+    i1 = wrap_index(i + 1, t.width, t.wrap_u)
+    row0 = t.start + wrap_index(j, t.height, t.wrap_v) * t.width
+    row1 = t.start + wrap_index(j + 1, t.height, t.wrap_v) * t.width
+    bottom = texel_color(scene, row0 + i0, t.srgb) * (1.0 - fx) + texel_color(scene, row0 + i1, t.srgb) * fx
+    top = texel_color(scene, row1 + i0, t.srgb) * (1.0 - fx) + texel_color(scene, row1 + i1, t.srgb) * fx
+    return bottom * (1.0 - fy) + top * fy
+
+
+@wp.func
+def triangle_uv(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32) -> wp.vec2:
+    ids = scene.geometry.indices[face]
+    uvs = scene.geometry.uvs
+    return uvs[ids[0]] * (1.0 - u - v) + uvs[ids[1]] * u + uvs[ids[2]] * v
+
+
+# Radiance that a triangle emits at a point, on its emitting side.
+@wp.func
+def emitted_radiance(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32) -> wp.vec3:
+    m = scene.materials[scene.geometry.materials[face]]
+    if m.emission_texture < 0:
+        return m.emission
+    texel = texture_lookup(scene, m.emission_texture, triangle_uv(scene, face, u, v))
+    return wp.cw_mul(m.emission, wp.vec3(texel[0], texel[1], texel[2]))
+
+
+# Distance by which a ray leaves the surface at `position`: above the rounding of positions
+# of that size (30 ulp), and of the scene's.
+@wp.func
+def ray_offset(position: wp.vec3, radius: wp.float32) -> wp.float32:
+    size = wp.max(wp.max(wp.abs(position[0]), wp.abs(position[1])), wp.abs(position[2]))
+    return 4.0e-6 * wp.max(size, 0.25 * radius)
+
+
+# Tangent-space normal of the material's normal map in world space, about the unit normal n.
+# The tangent is dp/du of the triangle, made perpendicular to n.
+@wp.func
+def mapped_normal(
+    scene: SceneData, texture: wp.int32, scale: wp.float32, face: wp.int32, uv: wp.vec2, n: wp.vec3
+) -> wp.vec3:
+    ids = scene.geometry.indices[face]
+    e1 = scene.geometry.points[ids[1]] - scene.geometry.points[ids[0]]
+    e2 = scene.geometry.points[ids[2]] - scene.geometry.points[ids[0]]
+    d1 = scene.geometry.uvs[ids[1]] - scene.geometry.uvs[ids[0]]
+    d2 = scene.geometry.uvs[ids[2]] - scene.geometry.uvs[ids[0]]
+    det = d1[0] * d2[1] - d1[1] * d2[0]
+    if wp.abs(det) < 1.0e-20:
+        return n
+    tangent = (e1 * d2[1] - e2 * d1[1]) * wp.sign(det)
+    tangent = tangent - n * wp.dot(n, tangent)
+    length = wp.length(tangent)
+    if length < 1.0e-20:
+        return n
+    tangent = tangent / length
+    bitangent = wp.cross(n, tangent) * wp.sign(det)
+    texel = texture_lookup(scene, texture, uv)
+    x = (texel[0] * 2.0 - 1.0) * scale
+    y = (texel[1] * 2.0 - 1.0) * scale
+    z = wp.max(texel[2] * 2.0 - 1.0, 1.0e-3)
+    return wp.normalize(tangent * x + bitangent * y + n * z)
+
+
+# Everything about the point (u, v) of triangle `face`, seen from direction wo.
+@wp.func
+def surface_at(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, wo: wp.vec3) -> Surface:
+    s = Surface()
+    g = scene.geometry
+    ids = g.indices[face]
+    p0 = g.points[ids[0]]
+    p1 = g.points[ids[1]]
+    p2 = g.points[ids[2]]
+    w = 1.0 - u - v
+    s.position = p0 * w + p1 * u + p2 * v
+    s.offset = ray_offset(s.position, scene.radius)
+    normal = wp.normalize(wp.cross(p1 - p0, p2 - p0))
+    shading = g.normals[ids[0]] * w + g.normals[ids[1]] * u + g.normals[ids[2]] * v
+    length = wp.length(shading)
+    if length > 1.0e-6:
+        shading = shading / length
+    else:
+        shading = normal
+    m = scene.materials[g.materials[face]]
+    base = m.base_color
+    roughness = m.roughness
+    metallic = m.metallic
+    uv = wp.vec2(0.0, 0.0)
+    if m.base_color_texture >= 0 or m.metallic_roughness_texture >= 0 or m.normal_texture >= 0:
+        uv = triangle_uv(scene, face, u, v)
+    if m.base_color_texture >= 0:
+        texel = texture_lookup(scene, m.base_color_texture, uv)
+        base = wp.cw_mul(base, wp.vec3(texel[0], texel[1], texel[2]))
+    if m.metallic_roughness_texture >= 0:
+        texel = texture_lookup(scene, m.metallic_roughness_texture, uv)
+        roughness = roughness * texel[1]
+        metallic = metallic * texel[2]
+    if m.normal_texture >= 0:
+        shading = mapped_normal(scene, m.normal_texture, m.normal_scale, face, uv, shading)
+    s.base_color = base
+    s.bsdf = make_bsdf(base, metallic, roughness, m.specular)
+    front = wp.dot(normal, wo) > 0.0
+    if front or m.double_sided != 0:
+        if g.emitters[face] >= 0:
+            s.emission = emitted_radiance(scene, face, u, v)
+    if not front:
+        normal = -normal
+        shading = -shading
+    s.normal = normal
+    # an interpolated normal may face away from the viewer: bend it until it just does not
+    slant = wp.dot(shading, wo)
+    if slant < 1.0e-3:
+        shading = wp.normalize(shading + wo * (1.0e-3 - slant) * 1.001)
+    s.shading = frame_of(shading)
+    return s
+
+
+# Where a ray starts that leaves the surface to the side of `normal`.
+@wp.func
+def ray_origin(s: Surface) -> wp.vec3:
+    return s.position + s.normal * s.offset

@@ -1,0 +1,95 @@
+"""A pipeline names one estimator for each term of the light."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+from warp_gi.errors import OptionError, unknown_name
+from warp_gi.estimator import Estimator
+from warp_gi.techniques.baselines import BsdfPaths, PowerLights, TracedEnvironment, UniformLights
+
+__all__ = ["PRESETS", "TERMS", "Estimator", "Pipeline"]
+
+TERMS = ("environment", "emitters", "indirect")
+FILTERS = ("box", "tent")
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """One estimator for each term, and how many samples they take. A term set to None is left out.
+
+    Raises OptionError for settings that make no sense.
+    """
+
+    environment: TracedEnvironment | None = TracedEnvironment()
+    """Direct light from the sky."""
+    emitters: PowerLights | UniformLights | None = PowerLights()
+    """Direct light from emissive triangles and punctual lights."""
+    indirect: BsdfPaths | None = BsdfPaths()
+    """Light that arrives over other surfaces."""
+    spp: int = 16
+    """Samples a pixel."""
+    camera_samples: int | None = None
+    """Distinct jittered camera rays a pixel that the samples are spread over; None is 4, or spp if that is
+    less. 1 gives pixel centres, spp one a sample as a reference wants."""
+    filter: str = "box"
+    """Pixel filter: "box" or "tent" (two pixels wide)."""
+
+    def __post_init__(self) -> None:
+        if self.spp < 1:
+            raise OptionError(f"spp must be at least 1, got {self.spp}")
+        if self.camera_samples is not None and not 1 <= self.camera_samples <= self.spp:
+            raise OptionError(f"camera_samples must be between 1 and spp ({self.spp}), got {self.camera_samples}")
+        if self.filter not in FILTERS:
+            raise unknown_name("pixel filter", self.filter, FILTERS)
+        for term, estimator in zip(TERMS, (self.environment, self.emitters, self.indirect), strict=True):
+            if estimator is not None and getattr(estimator, "term", None) != term:
+                raise OptionError(f"{term} must be an estimator of that term or None, got {estimator!r}")
+
+    @property
+    def camera_sample_count(self) -> int:
+        """Camera rays a pixel."""
+        return min(4, self.spp) if self.camera_samples is None else self.camera_samples
+
+    def estimators(self) -> Iterator[tuple[str, Estimator]]:
+        """Yield (term, estimator) of the terms that are not left out."""
+        for term in TERMS:
+            estimator = getattr(self, term)
+            if estimator is not None:
+                yield term, estimator
+
+    def describe(self) -> dict[str, Any]:
+        """Return all settings by dotted name, e.g. {"indirect": "BsdfPaths", "indirect.max_depth": 8, ...}."""
+        settings: dict[str, Any] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Estimator):
+                settings[field.name] = type(value).__name__
+                settings.update({f"{field.name}.{name}": setting for name, setting in asdict(value).items()})
+            else:
+                settings[field.name] = value
+        settings["camera_samples"] = self.camera_sample_count
+        return settings
+
+    @classmethod
+    def preset(cls, name: str, **settings: Any) -> Pipeline:
+        """Return the pipeline of that name, with fields replaced by ``settings``.
+
+        Raises OptionError for an unknown name or setting.
+        """
+        if name not in PRESETS:
+            raise unknown_name("pipeline", name, PRESETS)
+        known = {field.name for field in fields(cls)}
+        for setting in settings:
+            if setting not in known:
+                raise unknown_name("pipeline setting", setting, known)
+        return cls(**{**PRESETS[name], **settings})
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "path": {},
+    "direct": {"indirect": None},
+}
+"""Fields of each named pipeline, where they differ from the defaults."""

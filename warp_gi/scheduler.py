@@ -1,0 +1,344 @@
+"""The frame scheduler: preprocess, then trace, then compose, frame by frame."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Container, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+import warp_gi
+from warp_gi import launch
+from warp_gi.camera import Camera, CameraPath
+from warp_gi.errors import OptionError, unknown_name
+from warp_gi.kernels import compose, gbuffer, path_trace, types
+from warp_gi.pipeline import TERMS, Pipeline
+from warp_gi.scene.scene import Scene
+from warp_gi.techniques.baselines import BsdfPaths, PowerLights
+
+_VEC3_BUFFERS = ("beauty", "emission", *TERMS, "albedo", "normal", "position", "variance", "moment1", "moment2")
+BUFFERS = (
+    "beauty",
+    "emission",
+    *TERMS,
+    "albedo",
+    "normal",
+    "position",
+    "depth",
+    "motion",
+    "object_id",
+    "material_id",
+    "variance",
+)
+"""Names of a frame's buffers: radiance in W/(m^2 sr), lengths in m, motion in pixels, ids -1 for "nothing"."""
+
+
+class Frame:
+    """One picture in the making, then made: named buffers on a device.
+
+    ``frame["beauty"]`` is a wp.array of height * width items in rows from the top (vec3,
+    vec2, float32 or int32); ``frame.numpy("beauty")`` the same as an image.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        data: types.SceneData,
+        camera: Camera,
+        previous_camera: Camera,
+        pipeline: Pipeline,
+        device: wp.Device,
+        index: int,
+        frame_time: float,
+        seed: int,
+    ) -> None:
+        self.scene, self.data, self.pipeline, self.device = scene, data, pipeline, device
+        self.camera, self.previous_camera = camera, previous_camera
+        self.index = index
+        self.time = frame_time
+        """Seconds."""
+        self.seed = seed
+        """Of this frame: a hash of the sequence's seed and the frame's number."""
+        self.timings: dict[str, float] = {}
+        """Wall seconds by stage; "compile" is kernel compilation, left out of the others."""
+        self.metadata: dict[str, str | int | float] = {}
+        self._path_terms = 0
+        self._paths = BsdfPaths(max_depth=2)
+        width, height = camera.resolution
+        count = width * height
+
+        def zeros(dtype: Any) -> wp.array:
+            return wp.zeros(count, dtype=dtype, device=device)
+
+        self._arrays: dict[str, wp.array] = {name: zeros(wp.vec3) for name in _VEC3_BUFFERS}
+        self._arrays |= {
+            "depth": zeros(wp.float32),
+            "motion": zeros(wp.vec2),
+            "object_id": zeros(wp.int32),
+            "material_id": zeros(wp.int32),
+        }
+        self.hits = gbuffer.PrimaryHits()
+        self.hits.direction = zeros(wp.vec3)
+        for name in ("t", "u", "v"):
+            setattr(self.hits, name, zeros(wp.float32))
+        self.hits.face = zeros(wp.int32)
+        self.camera_data = camera_data(camera)
+        self.pass_settings = gbuffer.PassSettings()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the buffers."""
+        return BUFFERS
+
+    def __getitem__(self, name: str) -> wp.array:
+        """Return a buffer on the device, [height * width]; raises OptionError if there is none of that name."""
+        if name not in BUFFERS:
+            raise unknown_name("frame buffer", name, BUFFERS)
+        return self._arrays[name]
+
+    def numpy(self, name: str) -> np.ndarray:
+        """Return a buffer as an image, [height, width] or [height, width, channels], row 0 at the top."""
+        values = self[name].numpy()
+        width, height = self.camera.resolution
+        return values.reshape(height, width, *values.shape[1:])
+
+    def request_paths(self, term: int, paths: BsdfPaths | None = None) -> None:
+        """Ask for a term of the path-tracing launch that this camera sample's estimators share."""
+        self._path_terms |= int(term)
+        if paths is not None:
+            self._paths = paths
+
+    def launch(self, kernel: wp.Kernel, inputs: list[Any], count: int | None = None) -> None:
+        """Run a kernel over ``count`` items, or over every pixel."""
+        width, height = self.camera.resolution
+        launch.launch(kernel, width * height if count is None else count, inputs, self.device)
+
+    def launch_tiled(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
+        """Run a kernel over every pixel in tiles (``kernels.gbuffer.tiled_pixel``)."""
+        tiles = [math.ceil(size / gbuffer.TILE) for size in self.camera.resolution]
+        self.launch(kernel, inputs, tiles[0] * tiles[1] * gbuffer.TILE**2)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the wall time of a block to ``timings[name]``, compilation apart."""
+        compiled, started = launch.compile_seconds, time.perf_counter()
+        yield
+        wp.synchronize_device(self.device)
+        compiled = launch.compile_seconds - compiled
+        self.timings["compile"] = self.timings.get("compile", 0.0) + compiled
+        self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - started - compiled
+
+    def _struct(self, struct: Any) -> Any:
+        """Return a kernel struct whose fields are the buffers of the same names."""
+        filled = struct()
+        for name in struct.vars:
+            setattr(filled, name, self._arrays[name])
+        return filled
+
+
+class FrameScheduler:
+    """Renders frames of a scene along a camera path: bake once, then preprocess and trace each frame.
+
+    Args:
+        scene: What is rendered.
+        camera: A Camera, or a CameraPath whose frames are at ``index / fps`` seconds.
+        pipeline: The estimators.
+        device: "cpu", "cuda", "cuda:1".
+        seed: Every random number follows from it, the frame, the pixel and the sample.
+        progress: Called with (stage, share done in [0, 1]) while baking and tracing.
+
+    Raises OptionError for a device that is not there.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        camera: Camera | CameraPath,
+        pipeline: Pipeline,
+        device: str = "cpu",
+        seed: int = 0,
+        progress: Callable[[str, float], None] | None = None,
+    ) -> None:
+        if seed < 0:
+            raise OptionError(f"seed must be 0 or above, got {seed}")
+        self.scene, self.pipeline, self.seed = scene, pipeline, seed
+        self.camera = camera
+        self.device = launch.get_device(device)
+        self._progress = progress or (lambda stage, share: None)
+        self._estimators = dict(pipeline.estimators())
+        if "emitters" not in self._estimators:
+            self._light_sampler = PowerLights()  # next-event estimation along paths needs a distribution anyway
+        else:
+            self._light_sampler = None
+        self._states: dict[str, Any] = {}
+        self._bake_seconds = 0.0
+        self._baked = False
+        self._scene_hash = ""
+
+    def bake(self) -> None:
+        """Let every estimator compute what it can before the first frame; done by the first frame otherwise."""
+        if self._baked:
+            return
+        started = time.perf_counter()
+        for term, estimator in self._estimators.items():
+            self._progress(f"bake {term}", 0.0)
+            self._states[term] = estimator.bake(
+                self.scene, str(self.device), self.seed, lambda share, term=term: self._progress(f"bake {term}", share)
+            )
+        self._scene_hash = self.scene.hash
+        self._bake_seconds = time.perf_counter() - started
+        self._baked = True
+
+    def frame(self, index: int, previous_index: int | None = None) -> Frame:
+        """Render frame ``index``; motion is towards frame ``previous_index`` (None: the frame before it, if any)."""
+        self.bake()
+        if previous_index is None:
+            previous_index = max(index - 1, 0)
+        frame = self._new_frame(index, previous_index)
+        for term, estimator in self._estimators.items():
+            with frame.stage(f"preprocess {term}"):
+                self._states[term] = estimator.preprocess(frame, self._states[term])
+        if self._light_sampler is not None:
+            self._states["lights"] = self._light_sampler.preprocess(frame, self._states.get("lights"))
+        views = self.pipeline.camera_sample_count
+        for view in range(views):
+            self._trace_view(frame, view)
+            self._progress("trace", (view + 1) / views)
+        with frame.stage("compose"):
+            frame.launch(compose.compose_frame, [views, self.pipeline.spp, frame._struct(compose.FrameSums)])
+        return frame
+
+    def _new_frame(self, index: int, previous_index: int) -> Frame:
+        fps = self.camera.fps if isinstance(self.camera, CameraPath) else 24.0
+        started, compiled = time.perf_counter(), launch.compile_seconds
+        self.scene.update(index / fps, previous_index / fps, self.device)
+        data = _copied(self.scene.data(self.device), types.SceneData)
+        data.emitters = _copied(data.emitters, types.Emitters)
+        frame = Frame(
+            self.scene,
+            data,
+            self._camera_at(index),
+            self._camera_at(previous_index),
+            self.pipeline,
+            self.device,
+            index,
+            index / fps,
+            _mix(self.seed, index),
+        )
+        compiled = launch.compile_seconds - compiled
+        frame.timings |= {"bake": self._bake_seconds, "compile": compiled}
+        frame.timings["scene"] = time.perf_counter() - started - compiled
+        frame.metadata |= {
+            "seed": self.seed,
+            "scene": self.scene.name,
+            "scene_hash": self._scene_hash,
+            "version": warp_gi.__version__,
+            "device": self.device.name if self.device.is_cuda else "cpu",
+        }
+        frame.metadata |= {f"pipeline.{key}": value for key, value in self.pipeline.describe().items()}
+        return frame
+
+    def _camera_at(self, index: int) -> Camera:
+        return self.camera.camera(index) if isinstance(self.camera, CameraPath) else self.camera
+
+    def _trace_view(self, frame: Frame, view: int) -> None:
+        pipeline, settings = self.pipeline, frame.pass_settings
+        views = pipeline.camera_sample_count
+        settings.seed = frame.seed
+        settings.camera_sample = view
+        settings.camera_samples = views
+        settings.camera_bits = (views - 1).bit_length()
+        settings.first_sample = pipeline.spp * view // views
+        settings.sample_count = pipeline.spp * (view + 1) // views - settings.first_sample
+        settings.sample_bits = (pipeline.spp - 1).bit_length()
+        settings.tent = int(pipeline.filter == "tent")
+        with frame.stage("primary"):
+            frame.launch_tiled(gbuffer.trace_primary, [frame.data, frame.camera_data, settings, frame.hits])
+            previous = camera_data(frame.previous_camera)
+            buffers = frame._struct(gbuffer.SurfaceBuffers)
+            frame.launch(
+                gbuffer.shade_primary, [frame.data, frame.camera_data, previous, settings, frame.hits, buffers]
+            )
+        frame._path_terms = 0
+        for term, estimator in self._estimators.items():
+            with frame.stage(term):
+                estimator.trace(frame, self._states[term])
+        with frame.stage("paths"):
+            paths = path_trace.PathSettings()
+            paths.terms = frame._path_terms
+            paths.max_depth = frame._paths.max_depth
+            paths.roulette_depth = frame._paths.roulette_depth
+            paths.clamp = frame._paths.clamp
+            buffers = frame._struct(path_trace.PathBuffers)
+            frame.launch_tiled(
+                path_trace.trace_paths, [frame.data, frame.camera_data, settings, paths, frame.hits, buffers]
+            )
+
+
+def render(
+    scene: Scene,
+    camera: Camera | CameraPath,
+    pipeline: Pipeline | None = None,
+    frames: Iterable[int] | None = None,
+    device: str = "cpu",
+    seed: int = 0,
+    skip: Container[int] = (),
+    progress: Callable[[str, float], None] | None = None,
+) -> Iterator[Frame]:
+    """Yield the frames of a sequence.
+
+    Args:
+        scene: What is rendered.
+        camera: A Camera (one frame) or a CameraPath.
+        pipeline: The estimators; None is the preset "path".
+        frames: Frame numbers in order; None is every frame of the path.
+        device: "cpu", "cuda", "cuda:1".
+        seed: Every random number follows from it, the frame, the pixel and the sample.
+        skip: Frames that need not be rendered, because they exist already.
+        progress: Called with (stage, share done in [0, 1]).
+
+    Raises OptionError for a device that is not there, a negative frame or seed.
+    """
+    if frames is None:
+        frames = range(camera.frame_count if isinstance(camera, CameraPath) else 1)
+    frames = list(frames)
+    if any(index < 0 for index in frames):
+        raise OptionError(f"frame numbers must be 0 or above, got {min(frames)}")
+    scheduler = FrameScheduler(scene, camera, pipeline or Pipeline(), device, seed, progress)
+    for position, index in enumerate(frames):
+        if index not in skip:
+            yield scheduler.frame(index, frames[position - 1] if position else None)
+
+
+def camera_data(camera: Camera) -> gbuffer.CameraData:
+    """Return the camera as kernels read it."""
+    width, height = camera.resolution
+    right, up, back = camera.world_from_camera[:3, :3].T
+    half = math.tan(math.radians(camera.hfov) / 2)
+    data = gbuffer.CameraData()
+    data.position = wp.vec3(*camera.position)
+    data.right = wp.vec3(*(right * half))
+    data.up = wp.vec3(*(up * half * height / width))
+    data.forward = wp.vec3(*-back)
+    data.width, data.height = width, height
+    return data
+
+
+def _copied(source: Any, struct: Any) -> Any:
+    copy = struct()
+    for name in struct.vars:
+        setattr(copy, name, getattr(source, name))
+    return copy
+
+
+def _mix(seed: int, frame: int) -> int:
+    """Return a well-mixed 32-bit seed of a frame (splitmix64)."""
+    mask = (1 << 64) - 1
+    z = (seed * 0x9E3779B97F4A7C15 + frame * 0xD1B54A32D192ED03 + 0x9E3779B97F4A7C15) & mask
+    z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) & mask
+    z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & mask
+    return (z ^ (z >> 31)) & 0xFFFFFFFF

@@ -1,0 +1,109 @@
+"""The reference estimators. They share one path-tracing launch (``Frame.request_paths``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+
+from warp_gi.alias import AliasTable
+from warp_gi.errors import OptionError
+from warp_gi.estimator import Estimator
+from warp_gi.kernels import path_trace
+
+
+@dataclass(frozen=True)
+class TracedEnvironment(Estimator):
+    """Direct light from the sky by traced rays: BSDF and sky samples, combined by the balance heuristic.
+
+    A constant sky is sampled by the BSDF alone. Unbiased.
+    """
+
+    term: ClassVar[str] = "environment"
+
+    def trace(self, frame: Any, state: Any) -> None:
+        """Ask the shared path launch for this term."""
+        frame.request_paths(path_trace.TERM_ENVIRONMENT)
+
+
+@dataclass(frozen=True)
+class _SampledLights(Estimator):
+    """Direct light from emitters picked by a fixed distribution. Unbiased."""
+
+    term: ClassVar[str] = "emitters"
+
+    def weights(self, scene: Any) -> np.ndarray:
+        """Return relative selection probabilities, float64 [emitter_count]."""
+        raise NotImplementedError
+
+    def preprocess(self, frame: Any, state: Any) -> Any:
+        """Fill the alias table that every path vertex of the frame uses."""
+        if frame.scene.emitter_count == 0:
+            return None
+        if state is None:
+            table = AliasTable.build(self.weights(frame.scene))
+            state = [
+                wp.array(values, dtype=dtype, device=frame.device)
+                for values, dtype in (
+                    (table.probability, wp.float32),
+                    (table.index, wp.int32),
+                    (table.pdf, wp.float32),
+                )
+            ]
+        emitters = frame.data.emitters
+        emitters.alias_probability, emitters.alias_index, emitters.pdf = state
+        return state
+
+    def trace(self, frame: Any, state: Any) -> None:
+        """Ask the shared path launch for this term."""
+        frame.request_paths(path_trace.TERM_EMITTERS)
+
+
+@dataclass(frozen=True)
+class UniformLights(_SampledLights):
+    """Direct light from emissive triangles and punctual lights, each equally likely to be sampled. Unbiased."""
+
+    def weights(self, scene: Any) -> np.ndarray:
+        """Return ones."""
+        return np.ones(scene.emitter_count)
+
+
+@dataclass(frozen=True)
+class PowerLights(_SampledLights):
+    """Direct light from emissive triangles and punctual lights, sampled in proportion to their power. Unbiased."""
+
+    def weights(self, scene: Any) -> np.ndarray:
+        """Return each emitter's power."""
+        return scene.emitter_powers()
+
+
+@dataclass(frozen=True)
+class BsdfPaths(Estimator):
+    """Indirect light by path tracing: BSDF sampling, and next-event estimation at every vertex.
+
+    Unbiased but for ``max_depth`` and ``clamp``.
+    """
+
+    term: ClassVar[str] = "indirect"
+
+    max_depth: int = 8
+    """Edges of the longest path from camera to light: 2 is direct light only, 3 one bounce."""
+    roulette_depth: int = 5
+    """Paths of this many edges and more end at random, by their throughput."""
+    clamp: float = 0.0
+    """Largest component of one path's radiance, W/(m^2 sr); darkens fireflies. 0 is no limit."""
+
+    def validate(self) -> None:
+        """Raise OptionError for depths below 2 or a negative clamp."""
+        if self.max_depth < 2:
+            raise OptionError(f"max_depth must be at least 2 (direct light), got {self.max_depth}")
+        if self.roulette_depth < 2:
+            raise OptionError(f"roulette_depth must be at least 2, got {self.roulette_depth}")
+        if not self.clamp >= 0:
+            raise OptionError(f"clamp must be 0 (no limit) or a radiance above it, got {self.clamp}")
+
+    def trace(self, frame: Any, state: Any) -> None:
+        """Ask the shared path launch for this term."""
+        frame.request_paths(path_trace.TERM_INDIRECT, self)
