@@ -232,15 +232,20 @@ class FrameScheduler:
         compiled = launch.compile_seconds - compiled
         frame.timings |= {"bake": self._bake_seconds, "compile": compiled}
         frame.timings["scene"] = time.perf_counter() - started - compiled
-        frame.metadata |= {
+        frame.metadata |= self.metadata()
+        return frame
+
+    def metadata(self) -> dict[str, str | int | float]:
+        """Return what decides the pixels of every frame beside camera and time; a resumed run checks files against it."""
+        self.bake()
+        return {
             "seed": self.seed,
             "scene": self.scene.name,
             "scene_hash": self._scene_hash,
             "version": warp_gi.__version__,
             "device": self.device.name if self.device.is_cuda else "cpu",
+            **{f"pipeline.{key}": value for key, value in self.pipeline.describe().items()},
         }
-        frame.metadata |= {f"pipeline.{key}": value for key, value in self.pipeline.describe().items()}
-        return frame
 
     def _camera_at(self, index: int) -> Camera:
         return self.camera.camera(index) if isinstance(self.camera, CameraPath) else self.camera
