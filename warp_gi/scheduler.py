@@ -236,7 +236,7 @@ class FrameScheduler:
         return frame
 
     def metadata(self) -> dict[str, str | int | float]:
-        """Return what decides the pixels of every frame beside camera and time; a resumed run checks files against it."""
+        """Return what decides the pixels beside camera and time; a resumed run checks files against it."""
         self.bake()
         return {
             "seed": self.seed,
