@@ -101,7 +101,12 @@ def parse_frames(text: str) -> list[int]:
 
 
 def frame_attributes(
-    index: int, time: float, camera: Camera, metadata: Mapping[str, str | int | float]
+    index: int,
+    time: float,
+    camera: Camera,
+    metadata: Mapping[str, str | int | float],
+    previous_camera: Camera | None = None,
+    precision: str = "half",
 ) -> dict[str, Attribute]:
     """Return the EXR attributes of a frame, all but its stage times.
 
@@ -116,7 +121,10 @@ def frame_attributes(
         "hfov": float(camera.hfov),
         "worldToCamera": world_to_camera,
         "worldToNDC": world_to_ndc,
+        PREFIX + "precision": precision,
     }
+    if previous_camera is not None:  # motion is towards it
+        attributes["previousWorldToCamera"] = camera_matrices(previous_camera)[0]
     for key, value in metadata.items():
         if plain(value) != "":  # OpenEXR drops empty text
             attributes[PREFIX + key] = plain(value)
@@ -148,7 +156,8 @@ def write_frame(frame: FrameLike, pattern: str | Path, precision: str = "half") 
         return write_preview(frame, path)
     if path.suffix.lower() != ".exr":
         raise OptionError(f"cannot write {path.name}: frames are .exr or .png files")
-    attributes = frame_attributes(frame.index, frame.time, frame.camera, frame.metadata)
+    previous = getattr(frame, "previous_camera", None)
+    attributes = frame_attributes(frame.index, frame.time, frame.camera, frame.metadata, previous, precision)
     attributes |= {TIMES + stage: float(seconds) for stage, seconds in frame.timings.items()}
     buffers = {name: frame.numpy(name) for name in frame.names}
     with replacing(path) as part:
@@ -214,7 +223,7 @@ def why_not_whole(
         have, want = frame.attributes.get(name), expected.get(name)
         if isinstance(want, np.ndarray):
             if have is None or not np.array_equal(have, want.astype(np.float32)):
-                return "another camera"
+                return "another camera" if name.startswith("world") else "another frame before it"
         elif want is None or have != plain(want):
             return f"{name.removeprefix(PREFIX)} is {have!r} instead of {None if want is None else plain(want)!r}"
     return None
