@@ -1,0 +1,75 @@
+"""Make the reference pictures of the tests with Mitsuba 3: ``python -m warp_gi.bench.mitsuba_reference [NAME...]``.
+
+Each becomes tests/reference/NAME.exr with the mean (R, G, B) and the variance of that
+mean (variance.R, ...) over independent renderings, whose number it keeps as "renderings".
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import warp_gi as gi
+from warp_gi.bench.mitsuba_peer import load_mitsuba, to_mitsuba
+from warp_gi.bench.presets import PRESETS
+from warp_gi.errors import unknown_name
+from warp_gi.exr import write_exr
+
+FOLDER = Path(__file__).resolve().parents[1] / "tests" / "reference"
+
+
+def integrator(max_depth: int, masks: bool) -> Any:
+    """Return Mitsuba's path tracer without Russian roulette; the volumetric one if light passes through masks.
+
+    Mitsuba's ``path`` takes masks for opaque to shadow rays and counts them as vertices.
+    """
+    kind = "volpath" if masks else "path"
+    return load_mitsuba().load_dict({"type": kind, "max_depth": max_depth, "rr_depth": 1000})
+
+
+def reference(name: str, renderings: int, spp: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and variance of the mean, float64 [height, width, 3]."""
+    mi, preset = load_mitsuba(), PRESETS[name]
+    scene = preset.build()
+    masks = any(material.alpha_cutoff is not None for material in scene.materials)
+    peer, paths = to_mitsuba(scene, preset.camera), integrator(preset.max_depth, masks)
+    images = [np.array(mi.render(peer, integrator=paths, spp=spp, seed=1000 + i)) for i in range(renderings)]
+    images = np.stack(images).astype(np.float64)
+    return images.mean(axis=0), images.var(axis=0, ddof=1) / renderings
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", help=f"default: all of {', '.join(PRESETS)}")
+    parser.add_argument("--renderings", type=int, default=64)
+    parser.add_argument("--spp", type=int, default=512, help="samples a pixel of each rendering")
+    parser.add_argument("--output", type=Path, default=FOLDER)
+    options = parser.parse_args()
+    for name in options.names or PRESETS:
+        if name not in PRESETS:
+            raise unknown_name("reference", name, PRESETS)
+        if PRESETS[name].missing:
+            print(f"{name}: skipped, no {PRESETS[name].missing}")
+            continue
+        started = time.perf_counter()
+        mean, variance = reference(name, options.renderings, options.spp)
+        attributes = {
+            "renderer": f"Mitsuba {load_mitsuba().__version__}",
+            "renderings": options.renderings,
+            "samples": options.spp,
+            "maxDepth": PRESETS[name].max_depth,
+            "software": f"warp_gi {gi.__version__} bench",
+        }
+        options.output.mkdir(parents=True, exist_ok=True)
+        write_exr(options.output / f"{name}.exr", {"beauty": mean, "variance": variance}, attributes, precision="float")
+        noise = np.sqrt(variance.mean()) / mean.mean()
+        seconds = time.perf_counter() - started
+        print(f"{name}: mean {mean.mean():.5f}, noise of a pixel {noise:.3%}, {seconds:.0f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()

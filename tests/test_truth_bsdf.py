@@ -1,0 +1,218 @@
+"""The BSDF against formulas written anew in float64, its sampling against its density, its energy against 1."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import statistics_tools as st
+import warp as wp
+
+from warp_gi.kernels.bsdf import bsdf_evaluate, bsdf_sample, make_bsdf
+from warp_gi.kernels.sampling import cosine_direction, sample_1d, sample_2d, triangle_barycentrics
+from warp_gi.launch import launch
+
+wp.set_module_options({"enable_backward": False})
+
+CPU = wp.get_device("cpu")
+MATERIALS = {  # base colour, metallic, roughness, specular
+    "lambert": ((0.8, 0.5, 0.2), 0.0, 1.0, 0.0),
+    "plastic": ((0.8, 0.5, 0.2), 0.0, 0.3, 1.0),
+    "half_specular": ((0.9, 0.9, 0.9), 0.0, 0.6, 0.5),
+    "rough_metal": ((0.9, 0.6, 0.3), 1.0, 0.8, 1.0),
+    "smooth_metal": ((1.0, 1.0, 1.0), 1.0, 0.2, 1.0),
+    "mixed": ((0.2, 0.9, 0.4), 0.5, 0.5, 1.0),
+    "black_metal": ((0.0, 0.0, 0.0), 1.0, 0.5, 1.0),
+}
+VIEWS = {"normal": (0.0, 0.0, 1.0), "oblique": (0.6, 0.2, 0.77), "grazing": (-0.3, 0.94, 0.15)}
+
+
+# Thread: one pair of directions. f * cos and pdf.
+@wp.kernel
+def evaluate_bsdf(
+    first: wp.int32,
+    material: wp.array(dtype=wp.float32),
+    wo: wp.array(dtype=wp.vec3),
+    wi: wp.array(dtype=wp.vec3),
+    value: wp.array(dtype=wp.vec4),
+):
+    i = first + wp.tid()
+    b = make_bsdf(wp.vec3(material[0], material[1], material[2]), material[3], material[4], material[5])
+    r = bsdf_evaluate(b, wo[i], wi[i])
+    value[i] = wp.vec4(r.value[0], r.value[1], r.value[2], r.pdf)
+
+
+# Thread: one sample, numbered i of the sequence, or the first of sequence i.
+@wp.kernel
+def sample_bsdf(
+    first: wp.int32,
+    material: wp.array(dtype=wp.float32),
+    wo: wp.vec3,
+    wi: wp.array(dtype=wp.vec3),
+    weight: wp.array(dtype=wp.vec4),
+):
+    i = first + wp.tid()
+    b = make_bsdf(wp.vec3(material[0], material[1], material[2]), material[3], material[4], material[5])
+    seed = wp.uint32(i * 2 + 1)
+    r = bsdf_sample(b, wo, sample_1d(wp.uint32(0), seed, 0), sample_2d(wp.uint32(0), seed, 1))
+    wi[i] = r.wi
+    weight[i] = wp.vec4(r.weight[0], r.weight[1], r.weight[2], r.pdf)
+
+
+# Thread: one point of the sequence `seeds[i]`, and its warps.
+@wp.kernel
+def sample_warps(
+    first: wp.int32,
+    indices: wp.array(dtype=wp.uint32),
+    seeds: wp.array(dtype=wp.uint32),
+    square: wp.array(dtype=wp.vec2),
+    cosine: wp.array(dtype=wp.vec3),
+    triangle: wp.array(dtype=wp.vec2),
+):
+    i = first + wp.tid()
+    u = sample_2d(indices[i], seeds[i], 3)
+    square[i] = u
+    cosine[i] = cosine_direction(u)
+    triangle[i] = triangle_barycentrics(u)
+
+
+def parameters(name: str) -> np.ndarray:
+    base, *rest = MATERIALS[name]
+    return np.array([*base, *rest], dtype=np.float32)
+
+
+def unit(v: object) -> np.ndarray:
+    v = np.asarray(v, dtype=np.float64)
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def evaluate(name: str, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
+    """Return f * cos and pdf, float32 [n, 4], from the kernel."""
+    wo, wi = (np.ascontiguousarray(np.broadcast_to(d, wi.shape), dtype=np.float32) for d in (wo, wi))
+    out = wp.empty(len(wi), dtype=wp.vec4, device=CPU)
+    arrays = [wp.array(parameters(name), dtype=wp.float32, device=CPU)]
+    arrays += [wp.array(d, dtype=wp.vec3, device=CPU) for d in (wo, wi)]
+    launch(evaluate_bsdf, len(wi), [*arrays, out], CPU)
+    return out.numpy()
+
+
+def sample(name: str, wo: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return directions [n, 3] and weights with pdf [n, 4]; a failed sample is all zero."""
+    wi, weight = wp.empty(count, dtype=wp.vec3, device=CPU), wp.empty(count, dtype=wp.vec4, device=CPU)
+    material = wp.array(parameters(name), dtype=wp.float32, device=CPU)
+    launch(sample_bsdf, count, [material, wp.vec3(*wo), wi, weight], CPU)
+    weight = weight.numpy()
+    return np.where(weight[:, 3:] > 0, wi.numpy(), 0.0), weight
+
+
+def gltf(name: str, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
+    """BSDF times cosine, float64 [n, 3], as glTF 2.0 Appendix B and KHR_materials_specular state it."""
+    base, metallic, roughness, specular = MATERIALS[name]
+    base = np.asarray(base)
+    alpha2 = max(roughness**2, 1e-3) ** 2
+    half = unit(wo + wi)
+    n_h, v_h, n_l, n_v = half[:, 2], (wi * half).sum(-1), wi[:, 2], np.broadcast_to(wo, wi.shape)[:, 2]
+    d = alpha2 / (np.pi * (n_h**2 * (alpha2 - 1.0) + 1.0) ** 2)
+    v = 0.5 / (n_l * np.sqrt(n_v**2 * (1 - alpha2) + alpha2) + n_v * np.sqrt(n_l**2 * (1 - alpha2) + alpha2))
+    f0 = 0.04 * specular * (1 - metallic) + base * metallic
+    f90 = specular * (1 - metallic) + metallic
+    f = f0 + (f90 - f0) * (1 - v_h[:, None]) ** 5
+    value = (1 - f) * base * (1 - metallic) / np.pi + f * (d * v)[:, None]
+    return np.where((n_l > 0)[:, None], value * n_l[:, None], 0.0)
+
+
+def albedo(name: str, wo: np.ndarray) -> np.ndarray:
+    """Directional albedo, float64 [3]: the integral of `gltf` over the hemisphere, in half vectors drawn by GGX."""
+    nodes, weights = np.polynomial.legendre.leggauss(400)
+    s, phi = (nodes + 1) / 2, np.pi * (np.arange(400) + 0.5) / 200
+    alpha2 = max(MATERIALS[name][2] ** 2, 1e-3) ** 2
+    z = np.sqrt((1 - s) / (1 + (alpha2 - 1) * s))[:, None] * np.ones_like(phi)
+    ring = np.sqrt(1 - z * z)
+    half = np.stack([ring * np.cos(phi), ring * np.sin(phi), z], axis=-1).reshape(-1, 3)
+    v_h = half @ wo
+    wi = 2 * v_h[:, None] * half - wo
+    d = alpha2 / (np.pi * (half[:, 2] ** 2 * (alpha2 - 1) + 1) ** 2)
+    jacobian = np.where(v_h > 1e-9, 4 * v_h / (d * half[:, 2]), 0.0)
+    measure = (weights[:, None] / 2 * np.ones_like(phi) / len(phi)).ravel()
+    return (gltf(name, wo, np.where(v_h[:, None] > 1e-9, wi, [0, 0, -1.0])) * (jacobian * measure)[:, None]).sum(0)
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_value_is_what_gltf_defines_and_is_reciprocal(name):
+    rng = np.random.default_rng(1)
+    wo, wi = unit(rng.normal(size=(2, 4000, 3)))
+    wo[:, 2] = np.abs(wo[:, 2])
+    value = evaluate(name, wo, wi)
+    expected = gltf(name, wo, wi)
+    assert np.abs(value[:, :3] - expected).max() < 2e-4 * max(expected.max(), 1.0)
+    assert (value[wi[:, 2] <= 0] == 0).all()
+    assert (evaluate(name, wo * [1, 1, -1], wi) == 0).all()
+    upper = np.stack([wi[:, 0], wi[:, 1], np.abs(wi[:, 2])], axis=-1)
+    there, back = evaluate(name, wo, upper)[:, :3] / upper[:, 2:], evaluate(name, upper, wo)[:, :3] / wo[:, 2:]
+    assert np.allclose(there, back, rtol=2e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("name", MATERIALS)
+def test_sampling_follows_its_density(name, view):
+    count = 100_000
+    wo = unit(VIEWS[view])
+    directions, weight = sample(name, wo, count)
+    expected = st.sphere_expectation(lambda d: evaluate(name, wo, d)[:, 3], count, 24, 24, 40)
+    p = st.chi_squared(st.sphere_histogram(directions, 24, 24), expected, total=count)
+    assert p > 1e-4, f"p = {p:.1e}"
+    kept = weight[:, 3] > 0
+    again = evaluate(name, wo, directions[kept])  # what the sample says of itself is what evaluation says of it
+    assert np.allclose(weight[kept, 3], again[:, 3], rtol=2e-2)
+    assert np.allclose(weight[kept, :3] * weight[kept, 3:], again[:, :3], rtol=2e-2, atol=1e-6)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("name", MATERIALS)
+def test_mean_weight_is_the_directional_albedo(name, view):
+    wo = unit(VIEWS[view])
+    weight = sample(name, wo, 100_000)[1][:, :3].astype(np.float64)
+    expected = albedo(name, wo)
+    test = st.z_test(weight.mean(0), weight.var(0) / len(weight), expected, np.full(3, (3e-4) ** 2), alpha=1e-4)
+    assert test.passed, f"{weight.mean(0)} against {expected}, p = {test.p_min:.1e}"
+    if MATERIALS[name][1] == 1.0 or MATERIALS[name][3] == 0.0:
+        assert (
+            expected <= 1.0 + 1e-3
+        ).all()  # glTF's coated Lambert alone may gain: its 1 - F depends on the half vector
+
+
+def test_lambert_loses_nothing_and_smooth_white_metal_little():
+    for view in VIEWS.values():
+        assert (albedo("smooth_metal", unit(view)) > 0.93).all()  # the rest is shadowed: GGX has no second bounce
+        weight = sample("lambert", unit(view), 1000)[1]
+        assert np.allclose(weight[:, :3], MATERIALS["lambert"][0], rtol=1e-6)
+
+
+def warps(indices: np.ndarray, seeds: np.ndarray) -> list[np.ndarray]:
+    count = len(indices)
+    inputs = [wp.array(x.astype(np.uint32), dtype=wp.uint32, device=CPU) for x in (indices, seeds)]
+    outputs = [wp.empty(count, dtype=t, device=CPU) for t in (wp.vec2, wp.vec3, wp.vec2)]
+    launch(sample_warps, count, [*inputs, *outputs], CPU)
+    return [x.numpy() for x in outputs]
+
+
+def test_warps_follow_their_densities():
+    count = 200_000
+    square, cosine, triangle = warps(np.zeros(count), np.arange(count) * 7 + 5)
+    flat = np.full(256, count / 256)
+    assert st.chi_squared(np.histogram2d(*square.T, bins=16, range=[[0, 1]] * 2)[0], flat) > 1e-4
+    expected = st.sphere_expectation(lambda d: np.maximum(d[:, 2], 0) / np.pi, count)
+    assert st.chi_squared(st.sphere_histogram(cosine), expected, total=count) > 1e-4
+    # uniform over the triangle: of all points, k^2 / 64 lie within k/8 of the first corner; no weight is preferred
+    for weight in (triangle[:, 0], triangle[:, 1], 1 - triangle.sum(axis=1)):
+        assert weight.min() > -1e-6
+        cells = np.histogram(weight, bins=8, range=(0, 1))[0]
+        assert st.chi_squared(cells, count * -np.diff((1 - np.arange(9) / 8) ** 2)) > 1e-4
+
+
+def test_sequence_is_a_net():
+    """Any aligned run of 2^m samples has one in every elementary interval of area 2^-m."""
+    for start, m, seed in ((0, 8, 1), (256, 8, 1), (4096, 10, 77)):
+        points = warps(start + np.arange(2**m), np.full(2**m, seed))[0]
+        for a in range(m + 1):
+            cells = (points[:, 0] * 2**a).astype(int) * 2 ** (m - a) + (points[:, 1] * 2 ** (m - a)).astype(int)
+            assert (np.bincount(cells, minlength=2**m) == 1).all()
