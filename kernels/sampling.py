@@ -15,31 +15,32 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 _INTEGER_CODE = """
+typedef unsigned int Word;
 struct Bits {
-    static CUDA_CALLABLE inline uint32 reverse(uint32 x) {
+    static CUDA_CALLABLE inline Word reverse(Word x) {
         x = ((x >> 1) & 0x55555555u) | ((x & 0x55555555u) << 1);
         x = ((x >> 2) & 0x33333333u) | ((x & 0x33333333u) << 2);
         x = ((x >> 4) & 0x0f0f0f0fu) | ((x & 0x0f0f0f0fu) << 4);
         x = ((x >> 8) & 0x00ff00ffu) | ((x & 0x00ff00ffu) << 8);
         return (x >> 16) | (x << 16);
     }
-    static CUDA_CALLABLE inline uint32 hash(uint32 x) {
+    static CUDA_CALLABLE inline Word hash(Word x) {
         x ^= x >> 16; x *= 0x21f0aaadu; x ^= x >> 15; x *= 0x735a2d97u; x ^= x >> 15;
         return x;
     }
     // Laine-Karras permutation: flips each bit by a hash of the bits below it.
-    static CUDA_CALLABLE inline uint32 scramble(uint32 x, uint32 seed) {
+    static CUDA_CALLABLE inline Word scramble(Word x, Word seed) {
         x ^= x * 0x3d20adeau; x += seed; x *= (seed >> 16) | 1u;
         x ^= x * 0x05526c56u; x ^= x * 0x53a22864u;
         return x;
     }
     // Second Sobol dimension, bit-reversed: the Pascal matrix modulo 2 in five steps.
-    static CUDA_CALLABLE inline uint32 pascal(uint32 x) {
+    static CUDA_CALLABLE inline Word pascal(Word x) {
         x ^= (x >> 16); x ^= (x & 0xff00ff00u) >> 8; x ^= (x & 0xf0f0f0f0u) >> 4;
         x ^= (x & 0xccccccccu) >> 2; x ^= (x & 0xaaaaaaaau) >> 1;
         return x;
     }
-    static CUDA_CALLABLE inline float unit(uint32 x) { return float(x >> 8) * 5.9604644775390625e-8f; }
+    static CUDA_CALLABLE inline float unit(Word x) { return (float)(x >> 8) * 5.9604644775390625e-8f; }
 };
 """
 
@@ -52,9 +53,10 @@ def hash_uint(value: wp.uint32) -> wp.uint32: ...
 # Morton code of a pixel: x in the even bits, y in the odd bits.
 @wp.func_native(
     snippet="""
-    uint32 code = 0;
+    typedef unsigned int Word;
+    Word code = 0;
     for (int i = 0; i < 16; ++i)
-        code |= ((uint32(x) >> i) & 1u) << (2 * i) | ((uint32(y) >> i) & 1u) << (2 * i + 1);
+        code |= ((Word(x) >> i) & 1u) << (2 * i) | ((Word(y) >> i) & 1u) << (2 * i + 1);
     return code;
 """
 )
@@ -66,10 +68,10 @@ def morton_code(x: wp.int32, y: wp.int32) -> wp.uint32: ...
 @wp.func_native(
     snippet=_INTEGER_CODE
     + """
-    const uint32 key = Bits::hash(seed ^ Bits::hash(uint32(dimension) + 0x9e3779b9u));
-    const uint32 i = Bits::reverse(Bits::scramble(Bits::reverse(index), key));
-    const uint32 a = Bits::reverse(Bits::scramble(i, Bits::hash(key + 1u)));
-    const uint32 b = Bits::reverse(Bits::scramble(Bits::pascal(i), Bits::hash(key + 2u)));
+    const Word key = Bits::hash(seed ^ Bits::hash(Word(dimension) + 0x9e3779b9u));
+    const Word i = Bits::reverse(Bits::scramble(Bits::reverse(index), key));
+    const Word a = Bits::reverse(Bits::scramble(i, Bits::hash(key + 1u)));
+    const Word b = Bits::reverse(Bits::scramble(Bits::pascal(i), Bits::hash(key + 2u)));
     return wp::vec_t<2, float>(Bits::unit(a), Bits::unit(b));
 """
 )
@@ -80,8 +82,8 @@ def sample_2d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32) -> wp.vec2
 @wp.func_native(
     snippet=_INTEGER_CODE
     + """
-    const uint32 key = Bits::hash(seed ^ Bits::hash(uint32(dimension) + 0x9e3779b9u));
-    const uint32 i = Bits::reverse(Bits::scramble(Bits::reverse(index), key));
+    const Word key = Bits::hash(seed ^ Bits::hash(Word(dimension) + 0x9e3779b9u));
+    const Word i = Bits::reverse(Bits::scramble(Bits::reverse(index), key));
     return Bits::unit(Bits::reverse(Bits::scramble(i, Bits::hash(key + 1u))));
 """
 )

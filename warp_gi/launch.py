@@ -55,8 +55,8 @@ def set_threads(count: int | None) -> None:
 
 def _checked_threads(value: object) -> int:
     try:
-        count = int(value)  # type: ignore[call-overload]
-    except (TypeError, ValueError):
+        count = int(str(value))
+    except ValueError:
         count = 0
     if count < 1:
         raise OptionError(f"thread count must be a whole number of at least 1, got {value!r}")

@@ -1,0 +1,93 @@
+"""The launcher: slices, threads, and the checks that Warp does not make."""
+
+import numpy as np
+import pytest
+import warp as wp
+from warp_gi import launch
+from warp_gi.errors import OptionError
+
+CPU = wp.get_device("cpu")
+
+
+@wp.struct
+class Pair:
+    values: wp.array(dtype=wp.float32)
+    factor: wp.float32
+
+
+@wp.struct
+class OtherPair:
+    values: wp.array(dtype=wp.float32)
+    factor: wp.float32
+
+
+@wp.kernel(enable_backward=False)
+def scale_items(first: wp.int32, pair: Pair, out: wp.array(dtype=wp.float32)):
+    i = first + wp.tid()
+    out[i] = pair.values[i] * pair.factor + wp.float32(i)
+
+
+@wp.kernel(enable_backward=False)
+def without_first(out: wp.array(dtype=wp.float32)):
+    out[wp.tid()] = 1.0
+
+
+def make_pair(struct=Pair, values=None):
+    pair = struct()
+    pair.values = wp.array(np.arange(5000, dtype=np.float32), device=CPU) if values is None else values
+    pair.factor = 2.0
+    return pair
+
+
+@pytest.fixture(autouse=True)
+def default_threads():
+    yield
+    launch.set_threads(None)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3, 7])
+def test_every_item_once_on_any_number_of_threads(threads):
+    launch.set_threads(threads)
+    out = wp.zeros(5000, dtype=wp.float32, device=CPU)
+    launch.launch(scale_items, 5000, [make_pair(), out], CPU)
+    assert (out.numpy() == 3 * np.arange(5000)).all()
+
+
+def test_no_items_is_no_launch():
+    out = wp.zeros(1, dtype=wp.float32, device=CPU)
+    launch.launch(scale_items, 0, [make_pair(), out], CPU)
+    assert out.numpy()[0] == 0
+
+
+def test_wrong_arguments_raise():
+    out = wp.zeros(5000, dtype=wp.float32, device=CPU)
+    cases = [
+        (scale_items, [make_pair(OtherPair), out], "expected struct"),
+        (scale_items, [make_pair(), out.numpy()], "expected a wp.array"),
+        (scale_items, [make_pair(), wp.zeros(5, dtype=wp.int32, device=CPU)], "expected dtype"),
+        (scale_items, [make_pair(), wp.zeros((5, 5), dtype=wp.float32, device=CPU)], "dimensions"),
+        (scale_items, [make_pair()], "takes 2 inputs"),
+        (without_first, [], "first argument"),
+    ]
+    for kernel, inputs, words in cases:
+        with pytest.raises(TypeError, match=words):
+            launch.launch(kernel, 5, inputs, CPU)
+
+
+@pytest.mark.parametrize("count", [0, -1, "many", 1.5])
+def test_bad_thread_counts(count):
+    with pytest.raises(OptionError, match="thread count"):
+        launch.set_threads(count)
+
+
+def test_thread_count_from_the_environment(monkeypatch):
+    monkeypatch.setenv("WARP_GI_THREADS", "3")
+    assert launch.thread_count() == 3
+    monkeypatch.setenv("WARP_GI_THREADS", "none")
+    with pytest.raises(OptionError):
+        launch.thread_count()
+
+
+def test_missing_device_names_the_ones_there():
+    with pytest.raises(OptionError, match="cpu"):
+        launch.get_device("cuda:99")
