@@ -1,0 +1,102 @@
+"""Scenes from files."""
+
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warp_gi.errors import OptionError, SceneError
+from warp_gi.scene.images import missing_file
+from warp_gi.scene.model import Material, Mesh, Node
+from warp_gi.scene.parts import SceneParts
+from warp_gi.scene.scene import Scene
+
+EXTENSIONS = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
+
+
+def load_scene(
+    path: str | os.PathLike[str], environment: Any = None, smooth: float | None = None, scale: float = 1.0
+) -> Scene:
+    """Load a scene from a GLB, glTF, OBJ (with MTL), PLY, STL or OFF file.
+
+    Args:
+        path: The file; textures and buffers it names are looked up beside it.
+        environment: A path to a sky map, an RGB radiance, an Environment, a SunSky, or None for black.
+        smooth: Crease angle in degrees. Meshes without normals get smooth ones except across
+            edges that bend more than this; None leaves them flat, as glTF asks.
+        scale: Metres in one unit of the file. Radiance and intensities are left as they are.
+
+    Raises SceneError if the file or anything it names is missing, damaged or unusable: one line.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if not path.is_file():
+        raise missing_file(path, "scene file")
+    if suffix not in EXTENSIONS:
+        raise SceneError(f"{str(path)!r}: unknown kind of file {suffix!r}; expected one of {', '.join(EXTENSIONS)}")
+    if not (np.isfinite(scale) and scale > 0.0):
+        raise OptionError(f"scale must be a finite number above 0, got {scale}")
+    try:
+        parts = _read(path, suffix)
+    except SceneError:
+        raise
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError, EOFError, OSError, struct.error) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise SceneError(
+            f"{str(path)!r} cannot be read as {suffix[1:].upper()} ({type(error).__name__}: {reason}); it may be damaged"
+        ) from error
+    if smooth is not None:
+        parts = parts.smoothed(smooth)
+    if scale != 1.0:
+        parts = parts.scaled(scale)
+    if not any(len(mesh.indices) for node in parts.nodes for mesh in node.meshes):
+        raise SceneError(f"{str(path)!r} holds no triangles; export it with faces")
+    return Scene(parts.nodes, parts.lights, environment, parts.cameras, path.stem, parts.camera_nodes)
+
+
+def _read(path: Path, suffix: str) -> SceneParts:
+    if suffix in (".glb", ".gltf"):
+        from warp_gi.scene.loading_gltf import read_gltf
+
+        return read_gltf(path)
+    if suffix == ".obj":
+        from warp_gi.scene.loading_obj import read_obj
+
+        return read_obj(path)
+    return _read_single_mesh(path, suffix)
+
+
+def _read_single_mesh(path: Path, suffix: str) -> SceneParts:
+    """Read a file that holds one mesh without materials: PLY, STL or OFF."""
+    from trimesh.exchange.load import mesh_loaders
+
+    options = {"skip_materials": True} if suffix == ".ply" else {}
+    with path.open("rb") as file:
+        contents = mesh_loaders[suffix[1:]](file, file_type=suffix[1:], **options)
+    points, faces = contents.get("vertices"), contents.get("faces")
+    if points is None or faces is None or not len(faces):
+        raise SceneError(f"{str(path)!r} holds no triangles; export it with faces")
+    normals = contents.get("vertex_normals")
+    if normals is not None and np.shape(normals) != np.shape(points):
+        normals = None
+    mesh = Mesh(
+        np.asarray(points, np.float32),
+        triangulated(np.asarray(faces)),
+        Material(path.stem, specular=0.0),
+        None if normals is None else np.asarray(normals, np.float32),
+        getattr(contents.get("visual"), "uv", None),
+        path.stem,
+    )
+    return SceneParts([Node(path.stem, [mesh])])
+
+
+def triangulated(faces: np.ndarray) -> np.ndarray:
+    """Return faces [n, corners] as a fan of triangles each, int64 [m, 3]."""
+    if faces.ndim != 2 or faces.shape[1] < 3:
+        raise SceneError(f"faces must have at least 3 corners, got shape {list(faces.shape)}")
+    fans = [faces[:, [0, corner, corner + 1]] for corner in range(1, faces.shape[1] - 1)]
+    return np.stack(fans, axis=1).reshape(-1, 3).astype(np.int64)
