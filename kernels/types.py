@@ -101,10 +101,27 @@ class Emitters:
     pdf: wp.array(dtype=wp.float32)  # [count] probability of selecting the emitter
 
 
-# What a ray query needs; see bvh.py.
+# One way of cutting holes into triangles: a hit where the texture's bilinear
+# alpha times `factor` is below `cutoff` is passed through.
+@wp.struct
+class AlphaMask:
+    texture: wp.int32  # in Bvh.textures; its alpha is 1 where there is none
+    factor: wp.float32
+    cutoff: wp.float32
+
+
+# What a ray query needs; see bvh.py. The CPU reads nodes and blocks, CUDA reads mesh.
 @wp.struct
 class Bvh:
-    mesh: wp.uint64  # wp.Mesh id, the CUDA path
+    mesh: wp.uint64  # wp.Mesh id, 0 on the CPU
+    nodes: wp.array(dtype=wp.uint32)  # [node * NODE_WORDS] eight-wide, node 0 is the root
+    blocks: wp.array(dtype=wp.float32)  # [block * BLOCK_WORDS] four triangles each
+    face_masks: wp.array(dtype=wp.int32)  # [triangle] index in masks, -1 is opaque; empty where all are
+    masks: wp.array(dtype=AlphaMask)
+    indices: wp.array(dtype=wp.vec3i)  # [triangle] for uvs; empty where all are opaque
+    uvs: wp.array(dtype=wp.vec2)  # [vertex]
+    textures: wp.array(dtype=Texture)
+    texels: wp.array(dtype=wp.uint32)  # RGBA8
 
 
 @wp.struct

@@ -1,0 +1,258 @@
+"""TriangleBvh: any-hit and closest-hit ray queries on triangles, on the CPU and on CUDA."""
+
+from __future__ import annotations
+
+import mmap
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_gi import launch
+from warp_gi.errors import SceneError
+from warp_gi.kernels import bvh as queries
+from warp_gi.kernels import bvh_build as building
+from warp_gi.kernels import types
+
+SUBTREES = 64  # a build is shared out as about this many tasks
+MOST_TASKS = 1024
+HUGE_PAGE = 1 << 21  # bytes
+
+
+@dataclass(eq=False)
+class AlphaMasks:
+    """Holes cut by textures: a hit where bilinear alpha times factor is below the cutoff is passed through."""
+
+    face_mask: np.ndarray
+    """int32 [triangle]: index in ``masks``, -1 is opaque."""
+    masks: Sequence[tuple[int, float, float]]
+    """(index in ``textures`` or -1 for alpha 1, alpha factor, cutoff)."""
+    uvs: np.ndarray
+    """float32 [vertex, 2], v up."""
+    textures: wp.array
+    """dtype kernels.types.Texture, on the tree's device."""
+    texels: wp.array
+    """uint32 RGBA8, red in the low byte, on the tree's device."""
+
+
+@dataclass(eq=False)
+class Hits:
+    """Closest hits, one for each ray. The point is (1 - u - v) p0 + u p1 + v p2 in index-buffer order."""
+
+    t: wp.array
+    """float32 [ray], in units of the direction's length; t_max on a miss."""
+    face: wp.array
+    """int32 [ray], -1 on a miss."""
+    u: wp.array
+    """float32 [ray]"""
+    v: wp.array
+    """float32 [ray]"""
+
+
+class TriangleBvh:
+    """A tree over triangles for ray queries; ``data`` is the struct that kernels take (see kernels/bvh.py).
+
+    Args:
+        points: Vertex positions [m], shape [vertex, 3], float32. NumPy, Warp or anything with ``__dlpack__``.
+        indices: Vertices of each triangle, shape [triangle, 3], int32.
+        device: "cpu", "cuda", "cuda:1"...
+        alpha: Triangles with holes, or None.
+
+    Zero-area triangles are never hit. Raises SceneError when there are no triangles, a vertex is not finite, an
+    index is out of range or a shape is wrong.
+    """
+
+    def __init__(self, points: object, indices: object, device: str = "cpu", alpha: AlphaMasks | None = None) -> None:
+        self.device = launch.get_device(device)
+        corners = _checked_indices(indices)
+        positions = _checked_points(points)
+        low, high = int(corners.min()), int(corners.max())
+        if low < 0 or high >= len(positions):
+            raise SceneError(
+                f"triangle indices must be in 0 to {len(positions) - 1}, got {low if low < 0 else high}: "
+                "check the index buffer"
+            )
+        self.triangle_count = len(corners)
+        self.vertex_count = len(positions)
+        self.data = types.Bvh()
+        self._positions = wp.array(positions, dtype=wp.vec3, device=self.device)
+        self._indices = wp.array(corners.astype(np.int32), dtype=wp.vec3i, device=self.device)
+        self._alpha = alpha
+        if alpha is not None:
+            self._set_alpha(alpha)
+        if self.device.is_cpu:
+            self._build()
+        else:
+            self._mesh = _make_mesh(self._positions, corners, positions)
+            self.data.mesh = self._mesh.id
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of the tree itself, without points, indices and textures."""
+        if self.device.is_cpu:
+            return self.data.nodes.capacity + self.data.blocks.capacity
+        return 0 if self._mesh is None else 2 * 32 * self.triangle_count  # wp.Mesh: bounds and links, two nodes each
+
+    def refit(self, points: object) -> None:
+        """Move the vertices; same shape and triangles. Queries slow down as motion departs from the built pose."""
+        positions = _checked_points(points)
+        if len(positions) != self.vertex_count:
+            raise SceneError(f"refit expects {self.vertex_count} vertices, got {len(positions)}: build a new tree")
+        self._positions.assign(positions)
+        if self.device.is_cpu:
+            self._fill()
+        else:
+            self._mesh.refit()
+
+    def occluded(self, origins: object, directions: object, t_max: object = np.inf) -> wp.array:
+        """Return uint8 [ray]: 1 where something lies at 0 < t < t_max.
+
+        ``origins`` and ``directions`` are float32 [ray, 3], ``t_max`` a number or float32 [ray], in units of the
+        direction's length. Raises SceneError on other shapes.
+        """
+        rays = self._rays(origins, directions, t_max)
+        count = len(rays[0])
+        result = wp.empty(count, dtype=wp.uint8, device=self.device)
+        launch.launch(queries.occluded_rays, count, [self.data, *rays, result], self.device)
+        return result
+
+    def intersect(self, origins: object, directions: object, t_max: object = np.inf) -> Hits:
+        """Return the closest hits at 0 < t < t_max; arguments and errors as ``occluded``."""
+        rays = self._rays(origins, directions, t_max)
+        count = len(rays[0])
+        hits = queries.RayHits()
+        hits.t, hits.u, hits.v = (wp.empty(count, dtype=wp.float32, device=self.device) for _ in range(3))
+        hits.face = wp.empty(count, dtype=wp.int32, device=self.device)
+        launch.launch(queries.intersect_rays, count, [self.data, *rays, hits], self.device)
+        return Hits(hits.t, hits.face, hits.u, hits.v)
+
+    def _rays(self, origins: object, directions: object, t_max: object) -> list[wp.array]:
+        rays = [_vectors(origins, "ray origins", self.device), _vectors(directions, "ray directions", self.device)]
+        if len(rays[0]) != len(rays[1]):
+            raise SceneError(f"expected as many ray directions as origins ({len(rays[0])}), got {len(rays[1])}")
+        limits = t_max if isinstance(t_max, wp.array) else np.atleast_1d(_as_numpy(t_max)).astype(np.float32)
+        if limits.ndim != 1 or len(limits) not in (1, len(rays[0])):
+            raise SceneError(f"t_max must be a number or one for each of {len(rays[0])} rays, got shape {limits.shape}")
+        rays.append(wp.array(limits, dtype=wp.float32, device=self.device, copy=False))
+        return rays
+
+    def _set_alpha(self, alpha: AlphaMasks) -> None:
+        face_mask = np.ascontiguousarray(alpha.face_mask, dtype=np.int32)
+        uvs = np.ascontiguousarray(alpha.uvs, dtype=np.float32)
+        if face_mask.shape != (self.triangle_count,) or face_mask.max() >= len(alpha.masks):
+            raise SceneError(
+                f"face_mask must hold {self.triangle_count} indices below {len(alpha.masks)}, got shape "
+                f"{face_mask.shape} with maximum {face_mask.max(initial=-1)}"
+            )
+        if uvs.shape != (self.vertex_count, 2) or not np.isfinite(uvs).all():
+            raise SceneError(f"uvs must be {self.vertex_count} finite pairs, got shape {uvs.shape}")
+        masks = np.zeros(len(alpha.masks), dtype=types.AlphaMask.numpy_dtype())
+        for i, (texture, factor, cutoff) in enumerate(alpha.masks):
+            if not -1 <= texture < len(alpha.textures):
+                raise SceneError(f"alpha mask {i} names texture {texture}, but there are {len(alpha.textures)}")
+            masks[i] = (texture, factor, cutoff)
+        self.data.face_masks = wp.array(face_mask, dtype=wp.int32, device=self.device)
+        self.data.masks = wp.array(masks, dtype=types.AlphaMask, device=self.device)
+        self.data.uvs = wp.array(uvs, dtype=wp.vec2, device=self.device)
+        self.data.indices = self._indices
+        self.data.textures = alpha.textures
+        self.data.texels = alpha.texels
+
+    def _build(self) -> None:
+        count, device = self.triangle_count, self.device
+        build = building.BuildData()
+        build.refs = _empty(8 * count, wp.float32)
+        build.nodes = _empty(8 * (2 * count - 1), wp.float32)
+        build.costs = _empty(8 * (2 * count - 1), wp.float32)
+        build.choices = _empty(8 * (2 * count - 1), wp.uint8)
+        build.tasks = wp.empty(4 * MOST_TASKS, dtype=wp.int32, device=device)
+        build.top = wp.empty(MOST_TASKS, dtype=wp.int32, device=device)
+        build.counts = wp.full(4, -1, dtype=wp.int32, device=device)
+        counts = build.counts.numpy()  # a view
+        launch.launch(building.bound_triangles, count, [self._positions, self._indices, build.refs], device)
+        launch.launch(building.split_top, 1, [build, max(count // SUBTREES, 512)], device)
+        launch.launch(building.build_subtrees, int(counts[0]), [build], device, smallest_slice=1)
+        launch.launch(building.widen, 1, [build, None, None], device)
+        self.data.nodes = _empty(queries.NODE_WORDS * int(counts[2]), wp.uint32)
+        self.data.blocks = _empty(queries.BLOCK_WORDS * int(counts[3]), wp.float32)
+        launch.launch(building.widen, 1, [build, self.data.nodes, self.data.blocks], device)
+        self._fill()
+
+    def _fill(self) -> None:
+        blocks, nodes = self.data.blocks, self.data.nodes
+        launch.launch(
+            building.fill_blocks,
+            len(blocks) // queries.BLOCK_WORDS,
+            [self._positions, self._indices, self.data.face_masks, blocks],
+            self.device,
+        )
+        boxes = _empty(building.BOX_WORDS * (len(nodes) // queries.NODE_WORDS), wp.float32)
+        launch.launch(building.fill_nodes, 1, [nodes, blocks, boxes], self.device)
+
+
+def _make_mesh(points: wp.array, corners: np.ndarray, positions: np.ndarray) -> wp.Mesh:
+    """Return the wp.Mesh of the CUDA path, its zero-area triangles shrunk to a point, which no ray hits."""
+    a, b, c = (positions[corners[:, k]].astype(np.float64) for k in range(3))
+    flat = ~np.cross(b - a, c - a).any(axis=1)
+    corners = np.where(flat[:, None], corners[:, :1], corners)
+    indices = wp.array(np.ascontiguousarray(corners, dtype=np.int32).ravel(), dtype=wp.int32, device=points.device)
+    if points.device.is_cpu:
+        return wp.Mesh(points, indices, bvh_constructor="sah", bvh_leaf_size=4)
+    return wp.Mesh(points, indices)
+
+
+def _empty(length: int, dtype: type) -> wp.array:
+    """Return an uninitialised CPU array aligned to pages, huge ones where the system has them."""
+    size = max(length * np.dtype(wp.dtype_to_numpy(dtype)).itemsize, 1)
+    memory = mmap.mmap(-1, size)
+    if size >= HUGE_PAGE and hasattr(mmap, "MADV_HUGEPAGE"):
+        try:
+            memory.madvise(mmap.MADV_HUGEPAGE)
+        except OSError as error:  # a kernel without transparent huge pages: only slower
+            wp.utils.warn(f"huge pages are not available: {error}", once=True)
+    view = np.frombuffer(memory, dtype=wp.dtype_to_numpy(dtype), count=length)
+    return wp.array(view, dtype=dtype, device="cpu", copy=False)
+
+
+def _as_numpy(value: object) -> np.ndarray:
+    if isinstance(value, np.ndarray):
+        return value
+    if isinstance(value, wp.array):
+        return value.numpy()
+    if hasattr(value, "__dlpack__"):
+        return wp.from_dlpack(value).numpy()
+    return np.asarray(value)
+
+
+def _vectors(value: object, name: str, device: wp.Device) -> wp.array:
+    if isinstance(value, wp.array) and value.dtype is wp.vec3 and value.ndim == 1 and value.is_contiguous:
+        return value.to(device)
+    vectors = _as_numpy(value)
+    if vectors.ndim != 2 or vectors.shape[1] != 3:
+        raise SceneError(f"{name} must have shape [ray, 3], got {list(vectors.shape)}")
+    return wp.array(np.ascontiguousarray(vectors, dtype=np.float32), dtype=wp.vec3, device=device, copy=False)
+
+
+def _checked_points(points: object) -> np.ndarray:
+    positions = _as_numpy(points)
+    if positions.ndim != 2 or positions.shape[1] != 3:
+        raise SceneError(f"points must have shape [vertex, 3], got {list(positions.shape)}")
+    positions = np.ascontiguousarray(positions, dtype=np.float32)
+    if not np.isfinite(positions).all():
+        bad = int(np.flatnonzero(~np.isfinite(positions).all(axis=1))[0])
+        raise SceneError(f"vertex positions must be finite, but vertex {bad} is {positions[bad].tolist()}")
+    return positions
+
+
+def _checked_indices(indices: object) -> np.ndarray:
+    corners = _as_numpy(indices)
+    if corners.size == 0:
+        raise SceneError("expected at least one triangle, got none")
+    if corners.ndim != 2 or corners.shape[1] != 3 or corners.dtype.kind not in "iu":
+        raise SceneError(
+            f"indices must be whole numbers of shape [triangle, 3], got {corners.dtype} {list(corners.shape)}"
+        )
+    if len(corners) >= queries.FACE_MASKED:
+        raise SceneError(f"expected fewer than {queries.FACE_MASKED} triangles, got {len(corners)}")
+    return np.ascontiguousarray(corners.astype(np.int64))
