@@ -192,3 +192,33 @@ def sphere_expectation(
     density = np.asarray(pdf(directions), dtype=np.float64).reshape(rows, points, columns, points)
     cell_area = 4.0 * np.pi / (rows * columns)
     return np.einsum("rpcq,p,q->rc", density, weights, weights) * 0.25 * cell_area * count
+
+
+def renderings(
+    scene: object,
+    camera: object,
+    pipeline: object,
+    count: int,
+    buffer: str = "beauty",
+    device: str = "cpu",
+    seed: int = 1,
+) -> np.ndarray:
+    """Return ``count`` independent renderings of one view, float64 [count, height, width, channels]."""
+    import warp_gi as gi
+
+    path = gi.CameraPath.still(camera)
+    frames = gi.render(scene, path, pipeline, frames=range(count), device=device, seed=seed)
+    return np.stack([frame.numpy(buffer).astype(np.float64) for frame in frames])
+
+
+def assert_mean(images: np.ndarray, expected: object, alpha: float = 1e-4, tolerance: float = 0.0) -> None:
+    """Raise AssertionError unless the mean over all pixels of ``images`` [seed, h, w, 3] is ``expected`` (3 numbers).
+
+    ``tolerance`` is what the expectation itself may be off by, relative.
+    """
+    expected = np.broadcast_to(np.asarray(expected, dtype=np.float64), 3)
+    mean, variance = mean_and_variance(images.mean(axis=(1, 2)))
+    known = (tolerance * expected / 3.0) ** 2
+    test = z_test(mean, variance, expected, known, alpha, len(images) - 1)
+    sigma = np.sqrt(variance)
+    assert test.passed, f"mean {mean} is not {expected} (sigma {sigma}, p = {test.p_min:.1e})"
