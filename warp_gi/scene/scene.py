@@ -288,9 +288,12 @@ class _DeviceScene:
         low, high = scene.bounds
         data.center = wp.vec3(*(float(x) for x in (low.astype(np.float64) + high) / 2.0))
         data.radius = scene.radius
+        masks = textures.alpha_masks(scene.materials, images)
         alpha = None
-        if any(m.alpha_cutoff is not None for m in scene.materials):
-            alpha = AlphaMasks.of(data)
+        if masks:
+            mask_of = np.full(len(scene.materials), -1, np.int32)
+            mask_of[list(masks)] = np.arange(len(masks))
+            alpha = AlphaMasks(mask_of[flat.materials], list(masks.values()), flat.uvs, data.textures, data.texels)
         self.bvh = TriangleBvh(data.geometry.points, data.geometry.indices, device=device, alpha=alpha)
         data.bvh = self.bvh.data
         self.data = data

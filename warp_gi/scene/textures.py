@@ -90,11 +90,21 @@ def texture_table(textures: Sequence[Texture]) -> tuple[np.ndarray, np.ndarray]:
         start_of[id(image)] = start
         texels[start : start + size].view(np.uint8).reshape(image.shape)[:] = image[::-1]
     table = np.zeros(len(textures), types.Texture.numpy_dtype())
-    for row, texture in zip(table, textures, strict=True):
+    for index, texture in enumerate(textures):
         height, width = texture.pixels.shape[:2]
         wrap_u, wrap_v = (WRAPS[wrap] for wrap in texture.wrap)
-        row[...] = (start_of[id(texture.pixels)], width, height, wrap_u, wrap_v, int(texture.srgb))
+        table[index] = (start_of[id(texture.pixels)], width, height, wrap_u, wrap_v, int(texture.srgb))
     return table, texels
+
+
+def alpha_masks(materials: Sequence[Material], textures: Sequence[Texture]) -> dict[int, tuple[int, float, float]]:
+    """Return (texture index or -1, alpha factor, cutoff) by the index of each masked material."""
+    index_of = {id(texture): index for index, texture in enumerate(textures)}
+    return {
+        index: (index_of.get(id(m.base_color_texture), -1), m.alpha, m.alpha_cutoff)
+        for index, m in enumerate(materials)
+        if m.alpha_cutoff is not None
+    }
 
 
 def material_table(materials: Sequence[Material], textures: Sequence[Texture]) -> np.ndarray:
