@@ -1,0 +1,59 @@
+"""Compiles every kernel for CUDA, without a GPU: ``python -m warp_gi.bench.compile_cuda [ARCH ...]``, default 80 90."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import pkgutil
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+
+import warp as wp
+
+import warp_gi.kernels
+
+ARCHITECTURES = (80, 90)
+
+
+def kernel_modules() -> list[str]:
+    """Return the names of the modules in ``kernels/`` that hold kernels, all imported."""
+    names = [info.name for info in pkgutil.iter_modules(warp_gi.kernels.__path__, "warp_gi.kernels.")]
+    return [name for name in names if _has_kernels(importlib.import_module(name))]
+
+
+def compile_module(name: str, architectures: Sequence[int], folder: Path) -> list[Path]:
+    """Compile a kernel module for CUDA architectures such as 90 (sm_90); return the files written.
+
+    Raises RuntimeError or Warp's own error when the module does not compile.
+    """
+    paths = [Path(path) for path in wp.compile_aot_module(name, arch=list(architectures), module_dir=folder)]
+    if len(paths) < len(architectures) or not all(path.stat().st_size for path in paths):
+        raise RuntimeError(f"{name}: Warp wrote {[path.name for path in paths]} for architectures {architectures}")
+    return paths
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compile all and print what it took."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("arch", nargs="*", type=int, default=ARCHITECTURES, help="compute capability, as 90")
+    options = parser.parse_args(arguments)
+    wp.config.quiet = True
+    for name in kernel_modules():
+        started = time.perf_counter()
+        with tempfile.TemporaryDirectory() as folder:
+            paths = compile_module(name, options.arch, Path(folder))
+            size = sum(path.stat().st_size for path in paths)
+        print(f"{name}: {len(paths)} files, {size / 1e3:.0f} kB, {time.perf_counter() - started:.1f} s", flush=True)
+    return 0
+
+
+def _has_kernels(module: ModuleType) -> bool:
+    values = vars(module).values()
+    return any(isinstance(value, wp.Kernel) and value.module.name == module.__name__ for value in values)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,105 @@
+"""Finds and runs benchmark suites, prints their rows as tables and writes them as lines of JSON.
+
+A suite is a module of this folder with ``run(quick: bool, device: str) -> list[dict]``;
+its first docstring line says what it measures. Rows with the same keys make one table.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from warp_gi import launch
+from warp_gi.cli_report import print_table
+from warp_gi.errors import unknown_name
+from warp_gi.files import replacing
+
+FOLDER = Path(__file__).parent
+PACKAGES = ("warp-lang", "numpy", "mitsuba", "embreex")
+
+
+def suites(folder: Path = FOLDER) -> dict[str, str]:
+    """Return the suites and what they measure, without importing them."""
+    found = {}
+    for path in sorted(folder.glob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        if any(isinstance(node, ast.FunctionDef) and node.name == "run" for node in tree.body):
+            found[path.stem] = (ast.get_docstring(tree) or "").partition("\n")[0]
+    return found
+
+
+def run_suite(name: str, quick: bool, device: str) -> list[dict[str, Any]]:
+    """Run a suite and return its rows; raises OptionError if there is none of that name or no such device."""
+    if name not in (known := suites()):
+        raise unknown_name("benchmark suite", name, known)
+    launch.get_device(device)
+    return importlib.import_module(f"warp_gi.bench.{name}").run(quick=quick, device=device)
+
+
+def print_rows(title: str, rows: Sequence[dict[str, Any]]) -> None:
+    """Print rows as tables, one for each set of keys."""
+    tables: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for row in rows:
+        tables.setdefault(tuple(row), []).append(row)
+    for columns, group in tables.items():
+        print_table(title, columns, [list(row.values()) for row in group])
+
+
+def write_json_lines(path: Path, suite: str, rows: Sequence[dict[str, Any]], quick: bool, device: str) -> None:
+    """Write each row as a line of JSON, with what is needed to repeat it."""
+    common = {"suite": suite, "quick": quick, **environment(device)}
+    with replacing(path) as part:
+        part.write_text("".join(json.dumps({**common, **row}, default=float) + "\n" for row in rows), encoding="utf-8")
+
+
+def environment(device: str) -> dict[str, Any]:
+    """Return commit, versions, processor and device that a measurement was made with."""
+    import warp_gi
+
+    found = launch.get_device(device)
+    return {
+        "commit": commit(),
+        "warp_gi": warp_gi.__version__,
+        "python": platform.python_version(),
+        **{package: version for package in PACKAGES if (version := _version(package))},
+        "cpu": cpu_model(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "threads": launch.thread_count(),
+        "device": found.name if found.is_cuda else "cpu",
+    }
+
+
+def commit() -> str:
+    """Return the commit of the working tree, with "+" if it has changes, or "unknown" outside of one."""
+    try:
+        arguments = ["git", "-C", str(FOLDER), "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+"]
+        result = subprocess.run(arguments, capture_output=True, text=True, timeout=20)
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return result.stdout.strip() if result.returncode == 0 else "unknown"
+
+
+def cpu_model() -> str:
+    """Return the processor's name."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return platform.processor() or platform.machine()
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None

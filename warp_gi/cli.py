@@ -1,0 +1,92 @@
+"""The ``warp-gi`` command: dispatch, errors and exit codes."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from warp_gi.errors import GiError, unknown_name
+
+EXIT_ERROR = 2
+EXIT_INTERRUPTED = 130
+
+
+@dataclass(frozen=True)
+class Command:
+    """A subcommand: the module with its ``main(arguments)``, imported when called, and what it does."""
+
+    module: str
+    summary: str
+
+
+COMMANDS = {
+    "render": Command("warp_gi.cli_render", "render a sequence of frames to EXR files, with PNG previews"),
+    "compare": Command("warp_gi.cli_compare", "measure how far a picture is from its reference"),
+    "info": Command("warp_gi.cli_info", "print what a scene holds"),
+    "bench": Command("warp_gi.cli_bench", "run a benchmark suite"),
+}
+
+HELP = """usage: warp-gi COMMAND [OPTIONS]
+
+Precomputed and temporally reused global illumination on the CPU and on CUDA.
+
+commands:
+{commands}
+
+examples:
+  warp-gi render                                     the built-in atrium, with previews, to out/
+  warp-gi render hall.glb --environment city.exr --frames 0-47 --spp 64 -o out/hall.####.exr
+  warp-gi render hall.glb --resume ...               only the frames that are not there yet
+  warp-gi compare out/hall.0000.exr reference.exr    RMSE, relMSE, PSNR, FLIP and a picture of the difference
+
+`warp-gi COMMAND --help` lists the options of a command. Errors are one line on stderr and exit code 2;
+WARP_GI_DEBUG=1 shows where they came from.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code: 0, 2 after an error, 130 when interrupted."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        return _dispatch(arguments)
+    except BrokenPipeError:  # the reader of our output has gone, as in `warp-gi info x | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except (GiError, OSError, MemoryError) as error:
+        if os.environ.get("WARP_GI_DEBUG", "0") != "0":
+            raise
+        print(f"warp-gi: error: {_one_line(error)}", file=sys.stderr)
+        return EXIT_ERROR
+    except KeyboardInterrupt:
+        print("warp-gi: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+
+
+def _dispatch(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        listing = "\n".join(f"  {name:<9} {command.summary}" for name, command in COMMANDS.items())
+        print(HELP.format(commands=listing))
+        return 0 if arguments else EXIT_ERROR
+    if arguments[0] in ("-V", "--version"):
+        from warp_gi import __version__
+
+        print(f"warp-gi {__version__}")
+        return 0
+    if arguments[0] not in COMMANDS:
+        raise unknown_name("command", arguments[0], COMMANDS)
+    return importlib.import_module(COMMANDS[arguments[0]].module).main(arguments[1:])
+
+
+def _one_line(error: BaseException) -> str:
+    if isinstance(error, MemoryError):
+        return f"not enough memory {error}".strip()
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,48 @@
+"""``warp-gi bench``: the suites of ``bench/``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+import warp as wp
+
+from warp_gi import launch
+from warp_gi.bench import runner
+from warp_gi.cli_report import print_table
+
+
+@dataclass
+class Bench:
+    """Run a benchmark suite and print its tables. Without SUITE, list the suites."""
+
+    suite: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SUITE", help_behavior_hint="")] = ""
+    """Name of a module in bench/."""
+    quick: bool = False
+    """Smaller inputs, for a first look; not for figures that anyone quotes."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
+    """Also write each row as a line of JSON, with commit, versions, processor and settings."""
+    device: str = "cpu"
+    """cpu, cuda or cuda:1."""
+    threads: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: every core)")] = None
+    """Threads on the CPU."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the command."""
+    options = tyro.cli(Bench, prog="warp-gi bench", args=arguments)
+    if not options.suite:
+        print_table("suites", ("name", "what it measures"), sorted(runner.suites().items()))
+        return 0
+    wp.config.quiet = True
+    if options.threads is not None:
+        launch.set_threads(options.threads)
+    rows = runner.run_suite(options.suite, options.quick, options.device)
+    runner.print_rows(options.suite, rows)
+    if options.json is not None:
+        runner.write_json_lines(options.json, options.suite, rows, options.quick, options.device)
+        print(f"rows: {options.json}")
+    return 0

@@ -1,0 +1,250 @@
+"""``warp-gi render``: a sequence of frames to files."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+import warp as wp
+
+from warp_gi import launch
+from warp_gi.camera import Camera, CameraPath
+from warp_gi.cli_inputs import DEFAULT_SCENE, find_camera, find_scene, parse_resolution
+from warp_gi.cli_report import Reporter
+from warp_gi.errors import OptionError, unknown_name
+from warp_gi.files import remove_stale_parts
+from warp_gi.pipeline import TERMS, Estimator, Pipeline
+from warp_gi.scene.environment import SunSky
+from warp_gi.scheduler import FrameScheduler
+from warp_gi.sequence import (
+    frame_attributes,
+    frame_path,
+    parse_frames,
+    read_frame,
+    why_not_whole,
+    write_frame,
+    write_preview,
+)
+
+
+def _flag(metavar: str, default: str, *aliases: str) -> object:
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})", aliases=aliases)
+
+
+@dataclass
+class Render:
+    """Render a sequence of frames to EXR files with named layers, and PNG previews.
+
+    Without SCENE, the built-in atrium along its camera path. Files appear whole or not at
+    all: stop with Ctrl-C or kill the process at any time, and carry on with --resume.
+
+    Examples:
+      warp-gi render
+      warp-gi render hall.glb --environment city.exr --camera path.json --frames 0-47 --spp 64
+      warp-gi render hall.glb --eye 4 1.7 2 --target -3 1.6 -0.5 --hfov 70 -o out/still.exr --preview
+      warp-gi render cornell_box --pipeline path,emitters=UniformLights --indirect.max-depth 4
+    """
+
+    scene: Annotated[str, tyro.conf.Positional, _flag("SCENE", f"{DEFAULT_SCENE}, with previews")] = ""
+    """A GLB, glTF, OBJ or PLY file, or the name of a built-in scene."""
+    pipeline: Annotated[str, _flag("NAME", "path")] = "path"
+    """Preset, with estimators exchanged after commas: path,indirect=none. Its settings are the flags below."""
+    environment: Annotated[str, _flag("SKY", "the scene's own; files: none")] = ""
+    """The sky: a latitude-longitude EXR or HDR file, a radiance R,G,B, sun-sky, or none."""
+    environment_rotation: float = 0.0
+    """Turns the sky about +y, degrees, counter-clockwise seen from above."""
+    environment_scale: float = 1.0
+    """Multiplies the sky's radiance."""
+    sun: SunSky = field(default_factory=SunSky)
+    camera: Annotated[str, _flag("PATH", "the built-in path, the file's first camera, or one that sees all")] = ""
+    """A camera path in JSON, the name of a camera in the scene, or of a built-in scene whose path to take."""
+    eye: Annotated[tuple[float, float, float] | None, _flag("X Y Z", "use --camera")] = None
+    """Where a still camera stands, metres."""
+    target: Annotated[tuple[float, float, float] | None, _flag("X Y Z", "use --camera")] = None
+    """What it looks at."""
+    hfov: Annotated[float | None, _flag("DEGREES", "the camera's own; 65 with --eye")] = None
+    """Horizontal field of view of a still camera."""
+    frames: Annotated[str, _flag("LIST", "every frame of the path; 0 for a still camera")] = ""
+    """Frame numbers: 5, 0-47, 0-47:2 or 1,4,9-12."""
+    resolution: Annotated[str, _flag("WxH", "the camera's own")] = ""
+    """Width and height in pixels, as 960x540."""
+    seed: int = 1
+    """Every random number follows from it, the frame, the pixel and the sample."""
+    device: str = "cpu"
+    """cpu, cuda or cuda:1."""
+    threads: Annotated[int | None, _flag("N", "every core")] = None
+    """Threads on the CPU. The pictures do not depend on it."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = Path("out/shot.####.exr")
+    """Where frames go; #### becomes the frame's number."""
+    precision: Literal["half", "float"] = "half"
+    """Of colours and normals in EXR files; positions, depth, motion, ids and variance are float always."""
+    resume: bool = False
+    """Keep frames that are whole and were made with just these settings; render the others."""
+    preview: Annotated[bool, tyro.conf.arg(help_behavior_hint="(default: on without SCENE, else off)")] = False
+    """Write a tone-mapped PNG beside each frame."""
+    exposure: float = 0.0
+    """Of previews, in stops."""
+    quiet: bool = False
+    """Print nothing but errors."""
+    verbose: bool = False
+    """Print a table of the time of each stage."""
+    settings: Annotated[Pipeline, tyro.conf.arg(name="")] = field(default_factory=Pipeline)
+
+
+@dataclass
+class Shot:
+    """A frame to render, and where it goes."""
+
+    index: int
+    previous: int
+    """The frame that motion is towards."""
+    path: Path
+    time: float
+    """Seconds."""
+    camera: Camera
+    previous_camera: Camera
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the command."""
+    options = parse(arguments)
+    wp.config.quiet = True
+    if options.threads is not None:
+        launch.set_threads(options.threads)
+    run(options, Reporter(options.quiet))
+    return 0
+
+
+def parse(arguments: Sequence[str]) -> Render:
+    """Return the options; the pipeline named among them decides which settings there are."""
+    chosen = "path"
+    for index, argument in enumerate(arguments):
+        if argument == "--pipeline" and index + 1 < len(arguments):
+            chosen = arguments[index + 1]
+        elif argument.startswith("--pipeline="):
+            chosen = argument.partition("=")[2]
+    default = Render(settings=pipeline_named(chosen))
+    options = tyro.cli(
+        Render, prog="warp-gi render", args=arguments, default=default, config=(tyro.conf.AvoidSubcommands,)
+    )
+    if not options.scene and not {"--preview", "--no-preview"} & set(arguments):
+        options.preview = True
+    return options
+
+
+def pipeline_named(text: str) -> Pipeline:
+    """Return the pipeline of "path" or "path,indirect=none,emitters=UniformLights".
+
+    Raises OptionError for unknown presets, terms and estimators.
+    """
+    name, *changes = text.split(",")
+    pipeline = Pipeline.preset(name.strip())
+    known = {estimator.__name__: estimator for estimator in _subclasses(Estimator)}
+    for change in changes:
+        term, _, estimator = (part.strip() for part in change.partition("="))
+        if term not in TERMS:
+            raise unknown_name("term of a pipeline", term, TERMS)
+        if estimator.lower() == "none":
+            pipeline = replace(pipeline, **{term: None})
+        elif estimator in known:
+            pipeline = replace(pipeline, **{term: known[estimator]()})
+        else:
+            raise unknown_name(f"{term} estimator", estimator, [k for k, v in known.items() if v.term == term])
+    return pipeline
+
+
+def _subclasses(base: type) -> list[type]:
+    direct = base.__subclasses__()
+    return [c for c in direct if not c.__name__.startswith("_")] + [c for d in direct for c in _subclasses(d)]
+
+
+def run(options: Render, report: Reporter) -> None:
+    """Render what the options say."""
+    resolution = parse_resolution(options.resolution) if options.resolution else None
+    with report.phase("scene"):
+        scene = find_scene(options)
+        camera = find_camera(options, scene, report)
+    if resolution:
+        camera = camera.at_resolution(*resolution)
+    report.line(f"{scene.name}: {scene.triangle_count:,} triangles, {scene.emitter_count:,} emitters")
+    shots = plan(options, camera)
+    scheduler = FrameScheduler(scene, camera, options.settings, options.device, options.seed, report.stage)
+    with report.phase("bake"):
+        scheduler.bake()
+    todo = [shot for shot in shots if not options.resume or not is_done(options, shot, scheduler, report)]
+    if len(todo) < len(shots):
+        report.line(f"{len(shots) - len(todo)} of {len(shots)} frames are there already")
+    times: dict[str, list[float]] = {}
+    started = time.perf_counter()
+    with report.bar(len(todo)):
+        for shot in todo:
+            remove_stale_parts(shot.path)
+            frame_started, compiled = time.perf_counter(), launch.compile_seconds
+            frame = scheduler.frame(shot.index, shot.previous)
+            write_started = time.perf_counter()
+            write_shot(options, frame, shot.path)
+            finished = time.perf_counter()
+            frame_compiled = launch.compile_seconds - compiled
+            seconds = finished - frame_started - frame_compiled
+            note = f" and {frame_compiled:.1f} s compiling kernels" if frame_compiled > 0.5 else ""
+            report.frame(f"{shot.path} {seconds:.2f} s{note}", seconds)
+            for stage, value in {**frame.timings, "write": finished - write_started}.items():
+                times.setdefault(stage, []).append(value)
+    report.line(f"{len(todo)} frames in {time.perf_counter() - started:.1f} s: {options.output}")
+    if options.verbose and todo:
+        report.table(
+            "seconds by stage",
+            ("stage", "first frame", "mean", "largest", "sum"),
+            [(stage, v[0], sum(v) / len(v), max(v), sum(v)) for stage, v in times.items()],
+        )
+
+
+def plan(options: Render, camera: Camera | CameraPath) -> list[Shot]:
+    """Return the frames that were asked for."""
+    if options.frames:
+        frames = parse_frames(options.frames)
+    else:
+        frames = list(range(camera.frame_count)) if isinstance(camera, CameraPath) else [0]
+    if len(frames) > 1 and "#" not in options.output.name:
+        raise OptionError(f"{len(frames)} frames cannot all go to {options.output}; put #### in the name")
+    suffix = options.output.suffix.lower()
+    if suffix not in (".exr", ".png"):
+        raise OptionError(f"cannot write {options.output.name}: frames are .exr or .png files")
+    if suffix == ".png" and options.resume:
+        raise OptionError("--resume needs .exr files, which say how they were made; a .png does not")
+    path = camera if isinstance(camera, CameraPath) else CameraPath.still(camera)
+    at = path.camera if path is camera else lambda index: camera
+    previous = [max(frames[0] - 1, 0), *frames]
+    return [
+        Shot(index, before, frame_path(options.output, index), index / path.fps, at(index), at(before))
+        for index, before in zip(frames, previous, strict=False)
+    ]
+
+
+def is_done(options: Render, shot: Shot, scheduler: FrameScheduler, report: Reporter) -> bool:
+    """Return whether the frame's file is whole and made with the same settings; adds a missing preview."""
+    expected = frame_attributes(
+        shot.index, shot.time, shot.camera, scheduler.metadata(), shot.previous_camera, options.precision
+    )
+    problem = why_not_whole(shot.path, expected, shot.camera)
+    if problem is None:
+        preview = shot.path.with_suffix(".png")
+        if options.preview and not preview.exists():
+            write_preview(read_frame(shot.path), preview, options.exposure)
+    elif problem != "missing":
+        report.line(f"{shot.path} is rendered again: {problem}")
+    return problem is None
+
+
+def write_shot(options: Render, frame: object, path: Path) -> None:
+    """Write the preview, then the frame: a whole frame has its preview."""
+    if path.suffix.lower() == ".png":
+        write_preview(frame, path, options.exposure)
+        return
+    if options.preview:
+        write_preview(frame, path.with_suffix(".png"), options.exposure)
+    write_frame(frame, path, options.precision)

@@ -1,0 +1,142 @@
+"""What commands print: a progress bar on a terminal, plain lines elsewhere, tables, or nothing."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+
+class Reporter:
+    """Progress of a run on standard output.
+
+    Args:
+        quiet: Print nothing at all.
+        terminal: Draw a bar; None asks standard output whether it is a terminal.
+    """
+
+    def __init__(self, quiet: bool = False, terminal: bool | None = None) -> None:
+        self.quiet = quiet
+        self.terminal = not quiet and (sys.stdout.isatty() if terminal is None else terminal)
+        self._bar: Any = None
+        self._task: Any = None
+        self._total = self._done = 0
+        self._seconds: list[float] = []
+
+    def line(self, text: str) -> None:
+        """Print a line, above the bar if there is one."""
+        if self.quiet:
+            return
+        if self._bar is not None:
+            self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        else:
+            print(text, flush=True)
+
+    @contextmanager
+    def phase(self, name: str) -> Iterator[None]:
+        """Show that ``name`` is under way: a spinner on a terminal, a line with its seconds elsewhere."""
+        started = time.perf_counter()
+        if self.terminal and self._bar is None:
+            from rich.console import Console
+
+            with Console().status(name):
+                yield
+        else:
+            yield
+        self.line(f"{name}: {time.perf_counter() - started:.1f} s")
+
+    @contextmanager
+    def bar(self, total: int) -> Iterator[None]:
+        """Show progress over ``total`` frames while the block runs."""
+        self._total, self._done, self._seconds = total, 0, []
+        if not self.terminal:
+            yield
+            return
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+        columns = (
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("frames"),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[left]}"),
+            TextColumn("{task.description}", style="dim"),
+        )
+        with Progress(*columns) as self._bar:
+            self._task = self._bar.add_task("", total=total, left="")
+            try:
+                yield
+            finally:
+                self._bar.update(self._task, description="")
+                self._bar = None
+
+    def stage(self, name: str, share: float) -> None:
+        """Show how far into the current frame the run is; called often, cheap."""
+        if self._bar is not None:
+            inside = share if name == "trace" else 0.0
+            self._bar.update(self._task, completed=self._done + 0.99 * inside, description=f"{name} {share:.0%}")
+
+    def frame(self, text: str, seconds: float) -> None:
+        """Report a finished frame that took ``seconds``, compilation apart."""
+        self._done += 1
+        self._seconds.append(seconds)
+        left = self.time_left()
+        if self._bar is not None:
+            shown = f"{_clock(left)} left" if left is not None else ""
+            self._bar.update(self._task, completed=self._done, left=shown)
+        else:
+            rest = f", {_clock(left)} left" if left else ""
+            self.line(f"[{self._done}/{self._total}] {text}{rest}")
+
+    def time_left(self) -> float | None:
+        """Return an estimate of the seconds left: the mean of the last frames times the frames to go."""
+        if not self._seconds:
+            return None
+        recent = self._seconds[-8:]
+        return sum(recent) / len(recent) * (self._total - self._done)
+
+    def table(self, title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+        """Print a table; numbers are set to the right."""
+        if not self.quiet:
+            print_table(title, columns, rows)
+
+
+def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Print a table on standard output, plain enough for a log file."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    rows = [[_cell(value) for value in row] for row in rows]
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for index, column in enumerate(columns):
+        numeric = any(_is_number(row[index]) for row in rows)
+        table.add_column(column, justify="right" if numeric else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    width = None if sys.stdout.isatty() else 200
+    Console(width=width, markup=False, highlight=False, emoji=False).print(table)
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}"
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 1e5 else f"{value:.4g}"
+    return "" if value is None else str(value)
+
+
+def _is_number(text: str) -> bool:
+    return text[:1].isdigit() or (text[:1] in "-+." and text[1:2].isdigit())
+
+
+def _clock(seconds: float) -> str:
+    seconds = round(seconds)
+    if seconds < 60:
+        return f"{seconds} s"
+    minutes, seconds = divmod(seconds, 60)
+    return f"{minutes} min {seconds:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
