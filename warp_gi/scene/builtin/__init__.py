@@ -1,0 +1,47 @@
+"""Scenes made by code: no files, the same on every machine.
+
+``builtin_scene(name)`` builds one, ``builtin_camera_path(name)`` is the camera path that shows it.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+from warp_gi.errors import unknown_name
+
+if TYPE_CHECKING:
+    from warp_gi.camera import CameraPath
+    from warp_gi.scene.scene import Scene
+
+BUILTIN_SCENES = {
+    "atrium": "two storeys of arcades around a sunlit court, about 160K triangles",
+    "cornell_box": "the classic test of colour bleeding, in a box of 2 m",
+    "sphere_row": "metal spheres of rising roughness on a plane",
+    "street": "houses with balconies and trees with many leaves, about 130K triangles",
+    "two_rooms": "one lit and one dark room with a thin wall between them",
+    "warehouse": "rooms of shelves under hundreds of lamps, most of them hidden from any one point",
+}
+"""What there is: name and a line about it."""
+
+
+def builtin_scene(name: str) -> Scene:
+    """Return the built-in scene of that name, with cameras (at least "main") and its sky.
+
+    Raises OptionError for an unknown name.
+    """
+    return _module(name).scene()
+
+
+def builtin_camera_path(name: str) -> CameraPath:
+    """Return the camera path, 48 frames at 24 frames a second, that shows the built-in scene of that name.
+
+    Raises OptionError for an unknown name.
+    """
+    return _module(name).camera_path()
+
+
+def _module(name: str) -> object:
+    if name not in BUILTIN_SCENES:
+        raise unknown_name("built-in scene", name, BUILTIN_SCENES)
+    return importlib.import_module(f"warp_gi.scene.builtin.{name}")
