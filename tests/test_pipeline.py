@@ -1,0 +1,206 @@
+"""Pipeline, scheduler and frame: settings, buffers, motion, determinism."""
+
+import numpy as np
+import pytest
+import warp_gi as gi
+from warp_gi.camera import CameraKey
+from warp_gi.errors import OptionError
+from warp_gi.launch import set_threads
+
+SIZE = (24, 16)
+
+
+def quad(z=0.0, half=1.0, material=None):
+    """A square in the plane of z, facing +z; 0.5, 0.25, 0.125 Lambert unless told."""
+    points = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]], np.float32)
+    indices = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    return gi.Mesh(points, indices, material or gi.Material(base_color=(0.5, 0.25, 0.125), specular=0.0))
+
+
+def lit_scene(**settings):
+    """A grey card before a wall, under a sky and an emissive card."""
+    lamp = gi.Material("lamp", emission=(3.0, 2.0, 1.0))
+    aside = np.eye(4)
+    aside[:3, 3] = (1.5, 0.8, -1.0)
+    nodes = [
+        gi.Node("glow", [quad(half=0.2, material=lamp)], aside),
+        gi.Node("wall", [quad(-2.0, 5.0)]),
+        gi.Node("card", [quad()]),
+        gi.Node("lamp", [quad(4.0, 0.5, lamp)]),
+    ]
+    return gi.Scene(nodes, environment=(0.3, 0.4, 0.5), **settings)
+
+
+def camera(**settings):
+    return gi.Camera.look_at((0, 0, 3.5), (0, 0, 0), hfov=60, resolution=SIZE, **settings)
+
+
+def one_frame(scene=None, view=None, pipeline=None, **settings):
+    return next(gi.render(scene or lit_scene(), view or camera(), pipeline or gi.Pipeline(spp=4), **settings))
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: gi.Pipeline(spp=0), "spp"),
+        (lambda: gi.Pipeline(spp=4, camera_samples=5), "camera_samples"),
+        (lambda: gi.Pipeline(filter="gauss"), "pixel filter"),
+        (lambda: gi.Pipeline(indirect=gi.PowerLights()), "indirect"),
+        (lambda: gi.Pipeline(environment=3), "environment"),
+        (lambda: gi.Pipeline.preset("pth"), "did you mean 'path'"),
+        (lambda: gi.Pipeline.preset("path", ssp=3), "did you mean 'spp'"),
+        (lambda: gi.BsdfPaths(max_depth=1), "max_depth"),
+        (lambda: gi.BsdfPaths(roulette_depth=0), "roulette_depth"),
+        (lambda: gi.BsdfPaths(clamp=-1.0), "clamp"),
+        (lambda: list(gi.render(lit_scene(), camera(), device="cuda:77")), "not available"),
+        (lambda: list(gi.render(lit_scene(), camera(), frames=[-1])), "frame numbers"),
+        (lambda: list(gi.render(lit_scene(), camera(), seed=-1)), "seed"),
+        (lambda: one_frame()["beuty"], "did you mean 'beauty'"),
+    ],
+)
+def test_bad_settings_are_one_line(make, words):
+    with pytest.raises(OptionError, match=words) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+def test_terms_add_up_to_beauty_exactly():
+    frame = one_frame(pipeline=gi.Pipeline(spp=8))
+    terms = [frame.numpy(name) for name in ("emission", "environment", "emitters", "indirect")]
+    assert all(term.max() > 0 for term in terms)
+    assert np.array_equal(((terms[0] + terms[1]) + terms[2]) + terms[3], frame.numpy("beauty"))
+
+
+@pytest.mark.parametrize("left_out", ["environment", "emitters", "indirect"])
+def test_a_term_left_out_is_black_and_changes_no_other(left_out):
+    """Up to the light of other terms that share a path: only the noise may differ, and here not even that."""
+    whole = one_frame(pipeline=gi.Pipeline(spp=4))
+    part = one_frame(pipeline=gi.Pipeline(spp=4, **{left_out: None}))
+    for term in ("environment", "emitters", "indirect"):
+        if term == left_out:
+            assert not part.numpy(term).any() and whole.numpy(term).any()
+        else:
+            assert np.array_equal(part.numpy(term), whole.numpy(term))
+
+
+def test_threads_do_not_change_a_bit_and_seeds_do():
+    frames = []
+    for threads in (1, 2, 5):
+        set_threads(threads)
+        frames.append(one_frame(seed=4))
+    set_threads(None)
+    for name in frames[0].names:
+        for other in frames[1:]:
+            assert np.array_equal(frames[0].numpy(name), other.numpy(name), equal_nan=True)
+    assert not np.array_equal(one_frame(seed=5).numpy("beauty"), frames[0].numpy("beauty"))
+
+
+def test_frames_of_a_sequence_differ_in_noise_but_not_in_what_comes_before():
+    path = gi.CameraPath.still(camera())
+    frames = {f.index: f.numpy("beauty") for f in gi.render(lit_scene(), path, gi.Pipeline(spp=4), frames=[0, 1, 2])}
+    alone = next(gi.render(lit_scene(), path, gi.Pipeline(spp=4), frames=[2]))
+    assert not np.array_equal(frames[0], frames[1])
+    assert np.array_equal(alone.numpy("beauty"), frames[2])
+    kept = [f.index for f in gi.render(lit_scene(), path, gi.Pipeline(spp=1), frames=[0, 1, 2], skip={1})]
+    assert kept == [0, 2]
+
+
+def test_surface_buffers_at_pixel_centres():
+    scene, view = lit_scene(), camera()
+    frame = one_frame(scene, view, gi.Pipeline(spp=1, camera_samples=1))
+    names = [scene.object_names[i] for i in frame.numpy("object_id").ravel() if i >= 0]
+    assert {"wall", "card"} <= set(names)
+    middle = (SIZE[1] // 2, SIZE[0] // 2)
+    assert names and scene.object_names[frame.numpy("object_id")[middle]] == "card"
+    assert frame.numpy("depth")[middle] == pytest.approx(3.5, rel=1e-5)
+    assert np.allclose(frame.numpy("normal")[middle], (0, 0, 1))
+    assert np.allclose(frame.numpy("albedo")[middle], (0.5, 0.25, 0.125))
+    positions = frame.numpy("position").reshape(-1, 3)
+    hit = frame.numpy("object_id").ravel() >= 0
+    pixels = view.project(positions[hit])
+    x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
+    assert np.abs(pixels - np.stack([x.ravel(), y.ravel()], 1)[hit]).max() < 1e-3
+    depth = frame.numpy("depth").ravel()
+    assert np.allclose(depth[hit], 3.5 - positions[hit][:, 2], rtol=1e-5) and np.isinf(depth[~hit]).all()
+
+
+def test_motion_of_a_moving_camera_points_to_the_last_frame():
+    keys = (CameraKey(0.0, (0, 0, 3.5), (0, 0, 0)), CameraKey(1.0, (1, 0.5, 3.5), (0.5, 0, 0)))
+    path = gi.CameraPath(keys, fps=2, resolution=SIZE)
+    frame = next(gi.render(lit_scene(), path, gi.Pipeline(spp=1, camera_samples=1), frames=[1]))
+    hit = frame.numpy("object_id").ravel() >= 0
+    positions = frame.numpy("position").reshape(-1, 3)[hit]
+    expected = path.camera(0).project(positions) - path.camera(1).project(positions)
+    assert np.abs(expected).max() > 1
+    assert np.abs(frame.numpy("motion").reshape(-1, 2)[hit] - expected).max() < 1e-3
+
+
+def test_motion_of_a_moving_object_and_rest_around_it():
+    scene = lit_scene()
+    scene.animate("card", [gi.Keyframe(0.0), gi.Keyframe(1.0, translation=(0.5, 0.0, 0.0))])
+    path = gi.CameraPath.still(camera())
+    frame = next(gi.render(scene, path, gi.Pipeline(spp=1, camera_samples=1), frames=[12]))
+    ids, motion = frame.numpy("object_id"), frame.numpy("motion")
+    card = ids == scene.object_names.index("card")
+    pixels_a_metre = SIZE[0] / 2 / np.tan(np.radians(30)) / 3.5
+    assert np.abs(motion[card] - [-0.5 / 24 * pixels_a_metre, 0]).max() < 1e-3
+    assert np.abs(motion[~card]).max() < 1e-3
+
+
+def test_motion_of_the_sky_follows_the_turn_of_the_camera():
+    """A card far away and small: everything else is sky."""
+    keys = (CameraKey(0.0, (0, 0, 9), (0, 0, 0)), CameraKey(1.0, (0, 0, 9), (-1, 0, 0)))
+    path = gi.CameraPath(keys, fps=1, resolution=SIZE)
+    scene = gi.Scene([gi.Node("card", [quad(half=0.1)])], environment=(1.0, 1.0, 1.0))
+    frame = next(gi.render(scene, path, gi.Pipeline(spp=1, camera_samples=1), frames=[1]))
+    x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
+    now = path.camera(1)
+    half = np.tan(np.radians(now.hfov) / 2)
+    local = np.stack(
+        [(2 * x / SIZE[0] - 1) * half, (1 - 2 * y / SIZE[1]) * half * SIZE[1] / SIZE[0], -np.ones_like(x)], axis=-1
+    )
+    far = local @ now.world_from_camera[:3, :3].T * 1e9 + now.position
+    expected = path.camera(0).project(far.reshape(-1, 3)).reshape(SIZE[1], SIZE[0], 2) - np.stack([x, y], -1)
+    sky = frame.numpy("object_id") < 0
+    assert np.abs(frame.numpy("motion") - expected)[sky].max() < 1e-3
+
+
+def test_camera_samples_share_out_every_sample_and_filters_blur():
+    for spp, views in ((5, 2), (7, 7), (6, 4)):
+        frame = one_frame(pipeline=gi.Pipeline(spp=spp, camera_samples=views))
+        reference = one_frame(pipeline=gi.Pipeline(spp=256))
+        ratio = frame.numpy("environment").mean() / reference.numpy("environment").mean()
+        assert ratio == pytest.approx(1.0, abs=0.1)
+    edges = [one_frame(pipeline=gi.Pipeline(spp=64, camera_samples=64, filter=name)) for name in ("box", "tent")]
+    partial = [int(((f.numpy("albedo") % 0.125) > 1e-3).any(-1).sum()) for f in edges]
+    assert partial[1] >= partial[0]
+
+
+def test_clamp_bounds_each_path():
+    scene, pipeline = lit_scene(), gi.Pipeline(spp=4, indirect=gi.BsdfPaths(clamp=0.01))
+    assert one_frame(scene, pipeline=pipeline).numpy("indirect").max() <= 0.01 * (1 + 1e-6)
+    assert one_frame(scene).numpy("indirect").max() > 0.01
+
+
+def test_metadata_and_timings_tell_how_it_was_made():
+    frame = one_frame(seed=9)
+    assert frame.metadata["seed"] == 9
+    assert frame.metadata["pipeline.indirect"] == "BsdfPaths"
+    assert frame.metadata["pipeline.indirect.max_depth"] == 8
+    assert len(frame.metadata["scene_hash"]) == 64
+    assert {"bake", "compile", "scene", "primary", "paths", "compose"} <= set(frame.timings)
+    assert all(seconds >= 0 for seconds in frame.timings.values())
+
+
+def test_a_scene_without_light_is_black():
+    scene = gi.Scene([gi.Node("wall", [quad()])])
+    assert not one_frame(scene).numpy("beauty").any()
+
+
+def test_variance_predicts_the_spread_over_seeds():
+    """Of the mean of independent-sample estimates; stratification makes it an upper bound, within reason."""
+    scene = lit_scene()
+    images = [one_frame(scene, seed=s, pipeline=gi.Pipeline(spp=8, camera_samples=8)) for s in range(24)]
+    measured = np.var([f.numpy("beauty") for f in images], axis=0, ddof=1).mean()
+    predicted = np.mean([f.numpy("variance") for f in images])
+    assert 0.3 * predicted < measured < 1.3 * predicted
