@@ -11,6 +11,7 @@ Diffuse lobes are sampled by cosine, GGX by visible normals (Dupuy and Benyoub 2
 """
 
 import warp as wp
+
 from warp_gi.kernels.sampling import cosine_direction
 
 wp.set_module_options({"enable_backward": False})

@@ -1,6 +1,7 @@
 """Direct light from emissive triangles and punctual lights, selected by an alias table."""
 
 import warp as wp
+
 from warp_gi.kernels.alias import alias_choice_small
 from warp_gi.kernels.sampling import triangle_barycentrics
 from warp_gi.kernels.surface import emitted_radiance

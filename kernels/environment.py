@@ -6,6 +6,7 @@ a node (half way to its neighbours, so half a cell high at the poles) and is uni
 """
 
 import warp as wp
+
 from warp_gi.kernels.alias import alias_choice
 from warp_gi.kernels.types import ENVIRONMENT_CONSTANT, ENVIRONMENT_MAP, Environment
 

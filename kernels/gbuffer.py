@@ -1,6 +1,7 @@
 """Primary visibility: camera rays, first hits, and the buffers read off them."""
 
 import warp as wp
+
 from warp_gi.kernels.bvh import bvh_intersect
 from warp_gi.kernels.environment import environment_radiance
 from warp_gi.kernels.sampling import filter_offset, pixel_sample_index, pixel_seed, sample_2d

@@ -9,6 +9,7 @@ alone, which is better than any mixture for it.
 """
 
 import warp as wp
+
 from warp_gi.kernels.bsdf import bsdf_evaluate, bsdf_sample
 from warp_gi.kernels.bvh import BvhHit, bvh_intersect, bvh_occluded
 from warp_gi.kernels.emitters import sample_emitter, triangle_light_pdf

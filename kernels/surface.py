@@ -1,6 +1,7 @@
 """From a hit to a point with normals, texture coordinates, BSDF and emission."""
 
 import warp as wp
+
 from warp_gi.kernels.bsdf import Bsdf, make_bsdf
 from warp_gi.kernels.sampling import frame_of
 from warp_gi.kernels.types import WRAP_CLAMP, WRAP_MIRROR, SceneData

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 import warp_gi as gi
 from warp_gi.camera import CameraKey
 from warp_gi.errors import OptionError
@@ -199,7 +200,8 @@ def test_a_scene_without_light_is_black():
 
 def test_variance_predicts_the_spread_over_seeds():
     """Of the mean of independent-sample estimates; stratification makes it an upper bound, within reason."""
-    scene = lit_scene()
+    nodes = [node for node in lit_scene().nodes if node.name != "glow"]  # its edges are what stratifies best
+    scene = gi.Scene(nodes, environment=(0.3, 0.4, 0.5))
     images = [one_frame(scene, seed=s, pipeline=gi.Pipeline(spp=8, camera_samples=8)) for s in range(24)]
     measured = np.var([f.numpy("beauty") for f in images], axis=0, ddof=1).mean()
     predicted = np.mean([f.numpy("variance") for f in images])
