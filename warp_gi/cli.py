@@ -60,8 +60,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"warp-gi: error: {_one_line(error)}", file=sys.stderr)
         return EXIT_ERROR
-    except KeyboardInterrupt:
-        print("warp-gi: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        print(": ".join(["warp-gi: interrupted", *map(str, interrupt.args)]), file=sys.stderr)
         return EXIT_INTERRUPTED
 
 

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-import warp as wp
 
 from warp_gi import launch
 from warp_gi.bench import runner
-from warp_gi.cli_report import print_table
+from warp_gi.cli_report import print_table, start_warp
 
 
 @dataclass
@@ -37,7 +36,7 @@ def main(arguments: Sequence[str]) -> int:
     if not options.suite:
         print_table("suites", ("name", "what it measures"), sorted(runner.suites().items()))
         return 0
-    wp.config.quiet = True
+    start_warp(options.device)
     if options.threads is not None:
         launch.set_threads(options.threads)
     rows = runner.run_suite(options.suite, options.quick, options.device)

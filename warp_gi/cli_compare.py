@@ -22,8 +22,8 @@ from warp_gi.preview import to_bytes, tone_map, write_png
 class Compare:
     """Measure how far IMAGE is from REFERENCE: RMSE, relMSE, PSNR and FLIP, and write a picture of the difference.
 
-    EXR, HDR and NPY files are linear and FLIP is its HDR form; PNG and JPEG files are
-    sRGB-coded and FLIP is its LDR form.
+    EXR, HDR and NPY files are linear and FLIP is its HDR form; PNG and JPEG files are sRGB-coded and FLIP is its
+    LDR form.
     """
 
     image: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE")]

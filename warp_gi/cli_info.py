@@ -10,7 +10,7 @@ import tyro
 
 from warp_gi.camera import CameraPath
 from warp_gi.cli_inputs import open_scene
-from warp_gi.cli_report import print_table
+from warp_gi.cli_report import print_table, start_warp
 from warp_gi.scene.model import Material
 from warp_gi.scene.scene import Scene
 from warp_gi.scene.textures import distinct_textures
@@ -27,6 +27,7 @@ class Info:
 def main(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = tyro.cli(Info, prog="warp-gi info", args=arguments)
+    start_warp()
     scene = open_scene(options.scene)
     print_table(options.scene, ("what", "value"), summary(scene))
     print_table(
@@ -40,7 +41,7 @@ def main(arguments: Sequence[str]) -> int:
             (t.name, f"{t.pixels.shape[1]}x{t.pixels.shape[0]}", "sRGB" if t.srgb else "linear", *t.wrap)
             for t in textures
         ]
-        print_table("textures", ("name", "size", "sRGB", "wrap u", "wrap v"), rows)
+        print_table("textures", ("name", "size", "coding", "wrap u", "wrap v"), rows)
     if scene.lights:
         rows = [(light.name, light.kind, _numbers(light.intensity), _numbers(light.position)) for light in scene.lights]
         print_table("lights", ("name", "kind", "intensity", "position [m]"), rows)
@@ -92,4 +93,4 @@ def _material_row(material: Material) -> tuple[object, ...]:
 
 
 def _numbers(values: Sequence[float]) -> str:
-    return " ".join(f"{float(v):.3g}" for v in values)
+    return " ".join(f"{float(v) + 0.0:.3g}" for v in values)

@@ -24,18 +24,18 @@ if TYPE_CHECKING:
 DEFAULT_SCENE = "atrium"
 
 
-def open_scene(name: str) -> Scene:
-    """Return a built-in scene by name, or one from a file."""
+def open_scene(name: str, smooth: float | None = None, scale: float = 1.0) -> Scene:
+    """Return a built-in scene by name, or one from a file (``smooth`` and ``scale`` are those of ``load_scene``)."""
     if name in BUILTIN_SCENES and not Path(name).is_file():
         return builtin_scene(name)
     if not Path(name).suffix and not Path(name).exists():
         raise unknown_name("scene", name, BUILTIN_SCENES)
-    return load_scene(name)
+    return load_scene(name, smooth=smooth, scale=scale)
 
 
 def find_scene(options: Render) -> Scene:
     """Return the scene that was asked for, with its sky."""
-    scene = open_scene(options.scene or DEFAULT_SCENE)
+    scene = open_scene(options.scene or DEFAULT_SCENE, options.smooth, options.scale)
     if options.environment:
         scene.environment = parse_environment(options)
     elif options.environment_rotation or options.environment_scale != 1.0:

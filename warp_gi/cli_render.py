@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import signal
+import tempfile
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-import warp as wp
 
 from warp_gi import launch
 from warp_gi.camera import Camera, CameraPath
 from warp_gi.cli_inputs import DEFAULT_SCENE, find_camera, find_scene, parse_resolution
-from warp_gi.cli_report import Reporter
+from warp_gi.cli_report import Reporter, start_warp
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.files import remove_stale_parts
 from warp_gi.pipeline import TERMS, Estimator, Pipeline
@@ -35,22 +38,27 @@ def _flag(metavar: str, default: str, *aliases: str) -> object:
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})", aliases=aliases)
 
 
+DESCRIPTION = """Render a sequence of frames to EXR files with named layers, and PNG previews.
+
+Without SCENE, the built-in atrium along its camera path. Files appear whole or not at
+all: stop with Ctrl-C or kill the process at any time, and carry on with --resume.
+
+  warp-gi render
+  warp-gi render hall.glb --environment city.exr --camera path.json --frames 0-47 --spp 64
+  warp-gi render hall.glb --eye 4 1.7 2 --target -3 1.6 -0.5 -o out/still.exr --preview
+  warp-gi render cornell_box --pipeline path,emitters=UniformLights --indirect.max-depth 4"""
+
+
 @dataclass
 class Render:
-    """Render a sequence of frames to EXR files with named layers, and PNG previews.
+    """What to render, and how."""
 
-    Without SCENE, the built-in atrium along its camera path. Files appear whole or not at
-    all: stop with Ctrl-C or kill the process at any time, and carry on with --resume.
-
-    Examples:
-      warp-gi render
-      warp-gi render hall.glb --environment city.exr --camera path.json --frames 0-47 --spp 64
-      warp-gi render hall.glb --eye 4 1.7 2 --target -3 1.6 -0.5 --hfov 70 -o out/still.exr --preview
-      warp-gi render cornell_box --pipeline path,emitters=UniformLights --indirect.max-depth 4
-    """
-
-    scene: Annotated[str, tyro.conf.Positional, _flag("SCENE", f"{DEFAULT_SCENE}, with previews")] = ""
+    scene: Annotated[str, tyro.conf.Positional, _flag("[SCENE]", f"{DEFAULT_SCENE}, with previews")] = ""
     """A GLB, glTF, OBJ or PLY file, or the name of a built-in scene."""
+    smooth: Annotated[float | None, _flag("DEGREES", "flat, as glTF asks")] = None
+    """Smooth normals for meshes of a file that have none, except across edges that bend more than this."""
+    scale: float = 1.0
+    """Metres in one unit of the file."""
     pipeline: Annotated[str, _flag("NAME", "path")] = "path"
     """Preset, with estimators exchanged after commas: path,indirect=none. Its settings are the flags below."""
     environment: Annotated[str, _flag("SKY", "the scene's own; files: none")] = ""
@@ -82,15 +90,15 @@ class Render:
     """Where frames go; #### becomes the frame's number."""
     precision: Literal["half", "float"] = "half"
     """Of colours and normals in EXR files; positions, depth, motion, ids and variance are float always."""
-    resume: bool = False
+    resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Keep frames that are whole and were made with just these settings; render the others."""
     preview: Annotated[bool, tyro.conf.arg(help_behavior_hint="(default: on without SCENE, else off)")] = False
     """Write a tone-mapped PNG beside each frame."""
     exposure: float = 0.0
     """Of previews, in stops."""
-    quiet: bool = False
+    quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print nothing but errors."""
-    verbose: bool = False
+    verbose: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print a table of the time of each stage."""
     settings: Annotated[Pipeline, tyro.conf.arg(name="")] = field(default_factory=Pipeline)
 
@@ -112,7 +120,7 @@ class Shot:
 def main(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse(arguments)
-    wp.config.quiet = True
+    start_warp(options.device)
     if options.threads is not None:
         launch.set_threads(options.threads)
     run(options, Reporter(options.quiet))
@@ -129,7 +137,12 @@ def parse(arguments: Sequence[str]) -> Render:
             chosen = argument.partition("=")[2]
     default = Render(settings=pipeline_named(chosen))
     options = tyro.cli(
-        Render, prog="warp-gi render", args=arguments, default=default, config=(tyro.conf.AvoidSubcommands,)
+        Render,
+        prog="warp-gi render",
+        description=DESCRIPTION,
+        args=arguments,
+        default=default,
+        config=(tyro.conf.AvoidSubcommands,),
     )
     if not options.scene and not {"--preview", "--no-preview"} & set(arguments):
         options.preview = True
@@ -176,31 +189,63 @@ def run(options: Render, report: Reporter) -> None:
     with report.phase("bake"):
         scheduler.bake()
     todo = [shot for shot in shots if not options.resume or not is_done(options, shot, scheduler, report)]
+    if todo:
+        check_writable(options.output.parent)
     if len(todo) < len(shots):
         report.line(f"{len(shots) - len(todo)} of {len(shots)} frames are there already")
-    times: dict[str, list[float]] = {}
     started = time.perf_counter()
-    with report.bar(len(todo)):
-        for shot in todo:
-            remove_stale_parts(shot.path)
-            frame_started, compiled = time.perf_counter(), launch.compile_seconds
-            frame = scheduler.frame(shot.index, shot.previous)
-            write_started = time.perf_counter()
-            write_shot(options, frame, shot.path)
-            finished = time.perf_counter()
-            frame_compiled = launch.compile_seconds - compiled
-            seconds = finished - frame_started - frame_compiled
-            note = f" and {frame_compiled:.1f} s compiling kernels" if frame_compiled > 0.5 else ""
-            report.frame(f"{shot.path} {seconds:.2f} s{note}", seconds)
-            for stage, value in {**frame.timings, "write": finished - write_started}.items():
-                times.setdefault(stage, []).append(value)
-    report.line(f"{len(todo)} frames in {time.perf_counter() - started:.1f} s: {options.output}")
+    done: list[Shot] = []
+    times: dict[str, list[float]] = {}
+    try:
+        with stoppable() as stop, report.bar(len(todo)):
+            for shot in todo:
+                for stage, seconds in render_shot(options, shot, scheduler, report).items():
+                    times.setdefault(stage, []).append(seconds)
+                done.append(shot)
+                if stop.is_set():
+                    raise KeyboardInterrupt
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"{len(done)} of {len(todo)} frames written; --resume renders the others") from None
+    count = f"{len(todo)} frame{'s' * (len(todo) != 1)}"
+    report.line(f"{count} in {time.perf_counter() - started:.1f} s: {options.output}")
     if options.verbose and todo:
-        report.table(
-            "seconds by stage",
-            ("stage", "first frame", "mean", "largest", "sum"),
-            [(stage, v[0], sum(v) / len(v), max(v), sum(v)) for stage, v in times.items()],
-        )
+        times["bake"] = times["bake"][:1]  # every frame names the one bake
+        rows = [(stage, *(f"{x:.3f}" for x in (v[0], sum(v) / len(v), max(v), sum(v)))) for stage, v in times.items()]
+        report.table("seconds by stage", ("stage", "first frame", "mean", "largest", "sum"), rows)
+
+
+def render_shot(options: Render, shot: Shot, scheduler: FrameScheduler, report: Reporter) -> dict[str, float]:
+    """Render a frame, write it, and return the seconds of its stages."""
+    remove_stale_parts(shot.path)
+    started, compiled = time.perf_counter(), launch.compile_seconds
+    frame = scheduler.frame(shot.index, shot.previous)
+    rendered = time.perf_counter()
+    write_shot(options, frame, shot.path)
+    finished = time.perf_counter()
+    compiled = launch.compile_seconds - compiled
+    seconds = finished - started - compiled
+    note = f" and {compiled:.1f} s compiling kernels" if compiled > 0.5 else ""
+    report.frame(f"{shot.path} {seconds:.2f} s{note}", seconds)
+    return {**frame.timings, "write": finished - rendered}
+
+
+@contextmanager
+def stoppable() -> Iterator[threading.Event]:
+    """Yield an event that Ctrl-C sets, besides raising KeyboardInterrupt, which a callback or finaliser may swallow."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+
+    def interrupt(number: int, frame: object) -> None:
+        stop.set()
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def plan(options: Render, camera: Camera | CameraPath) -> list[Shot]:
@@ -223,6 +268,13 @@ def plan(options: Render, camera: Camera | CameraPath) -> list[Shot]:
         Shot(index, before, frame_path(options.output, index), index / path.fps, at(index), at(before))
         for index, before in zip(frames, previous, strict=False)
     ]
+
+
+def check_writable(folder: Path) -> None:
+    """Make the folder; raises OSError now, not after the first frame, if nothing can be written there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=folder):
+        pass
 
 
 def is_done(options: Render, shot: Shot, scheduler: FrameScheduler, report: Reporter) -> bool:

@@ -1,0 +1,337 @@
+"""The command line, as a user meets it."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warp_gi import cli, sequence
+from warp_gi.preview import write_png
+
+SMALL = ["cornell_box", "--resolution", "24x16", "--spp", "4"]
+COMMAND = [sys.executable, "-m", "warp_gi.cli"]
+
+
+def run(*arguments, **options):
+    """Run warp-gi in a process of its own."""
+    return subprocess.run([*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=300, **options)
+
+
+def same_frame(a, b):
+    """Whether two files are equal in pixels and all metadata but the stage times."""
+    a, b = sequence.read_frame(a), sequence.read_frame(b)
+    keep = [{k: v for k, v in f.attributes.items() if not k.startswith(sequence.TIMES)} for f in (a, b)]
+    return (
+        a.names == b.names
+        and all(np.array_equal(a.numpy(name), b.numpy(name), equal_nan=True) for name in a.names)
+        and keep[0].keys() == keep[1].keys()
+        and all(np.array_equal(keep[0][key], keep[1][key]) for key in keep[0])
+    )
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory):
+    """Four small frames with previews, rendered in one go."""
+    folder = tmp_path_factory.mktemp("unbroken")
+    result = run("render", *SMALL, "--frames", "0-3", "--preview", "-o", folder / "a.####.exr")
+    assert result.returncode == 0, result
+    assert result.stderr == ""
+    lines = result.stdout.splitlines()
+    assert any(line.startswith("[4/4] ") for line in lines) and any("left" in line for line in lines)
+    return folder
+
+
+def test_render_writes_frames_and_previews(unbroken):
+    assert sorted(path.name for path in unbroken.iterdir()) == sorted(
+        f"a.{i:04d}.{kind}" for i in range(4) for kind in ("exr", "png")
+    )
+    frame = sequence.read_frame(unbroken / "a.0002.exr")
+    assert frame.index == 2 and frame.time == pytest.approx(2 / 24)
+    assert frame.metadata["seed"] == 1 and frame.metadata["pipeline.spp"] == 4
+    assert {"paths", "compile", "bake"} <= set(frame.timings)
+    terms = [frame.numpy(name) for name in ("emission", "environment", "emitters", "indirect")]
+    np.testing.assert_allclose(sum(terms), frame.numpy("beauty"), rtol=4e-3, atol=1e-3)
+    assert frame.numpy("beauty").max() > 0.1
+
+
+def test_resume_keeps_whole_frames_and_redoes_the_others(unbroken, tmp_path, capsys):
+    folder = tmp_path / "resumed"
+    shutil.copytree(unbroken, folder)
+    torn = folder / "a.0001.exr"
+    torn.write_bytes(torn.read_bytes()[:-1])
+    (folder / "a.0002.exr").unlink()
+    (folder / "a.0003.png").unlink()
+    kept = (folder / "a.0000.exr").stat().st_mtime_ns
+    assert cli.main(["render", *SMALL, "--frames=0-3", "--preview", "--resume", "-o", f"{folder}/a.####.exr"]) == 0
+    printed = capsys.readouterr().out
+    assert "a.0001.exr is rendered again: not whole" in printed and "2 of 4 frames are there already" in printed
+    assert (folder / "a.0000.exr").stat().st_mtime_ns == kept
+    for path in unbroken.iterdir():
+        if path.suffix == ".png":
+            assert path.read_bytes() == (folder / path.name).read_bytes(), path.name
+        else:
+            assert same_frame(path, folder / path.name), path.name
+
+
+@pytest.mark.parametrize(
+    "change, reason",
+    [
+        (["--seed", "2"], "seed is 1 instead of 2"),
+        (["--indirect.max-depth", "3"], "pipeline.indirect.max_depth is 8 instead of 3"),
+        (["--pipeline", "direct"], "pipeline.indirect is 'BsdfPaths' instead of 'None'"),
+        (["--environment", "1,1,1"], "scene_hash"),
+        (["--resolution", "12x8"], "24x16 instead of 12x8"),
+        (["--precision", "float"], "precision is 'half' instead of 'float'"),
+    ],
+)
+def test_resume_redoes_frames_of_other_settings(unbroken, tmp_path, capsys, change, reason):
+    shutil.copy(unbroken / "a.0000.exr", tmp_path)
+    command = ["render", *SMALL, "--frames=0", "--resume", *change, "-o", str(tmp_path / "a.####.exr")]
+    assert cli.main(command) == 0
+    assert f"rendered again: {reason}" in capsys.readouterr().out
+
+
+def _start(folder, *extra):
+    frames = ["render", "cornell_box", "--resolution=48x32", "--spp=64", "--frames=0-7"]
+    command = [*COMMAND, *frames, "--quiet", "-o", folder / "a.####.exr", *extra]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def _wait_for(folder, count):
+    deadline = time.monotonic() + 200
+    while len(list(folder.glob("a.*.exr"))) < count:
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+
+
+def test_killed_runs_resume_to_the_same_files(unbroken, tmp_path):
+    broken, whole = tmp_path / "broken", tmp_path / "whole"
+    for count in (1, 3, 4):
+        process = _start(broken, "--resume", "--preview")
+        _wait_for(broken, count)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+        for path in broken.glob("a.*.exr"):
+            assert sequence.is_whole(path), path
+    for folder in (broken, whole):
+        process = _start(folder, "--resume", "--preview")
+        assert process.communicate(timeout=200) == ("", "") and process.returncode == 0
+    names = sorted(path.name for path in whole.iterdir())
+    assert len(names) == 16
+    leftovers = [path for path in broken.iterdir() if path.name not in names]
+    assert leftovers == []
+    for name in names:
+        a, b = broken / name, whole / name
+        assert same_frame(a, b) if name.endswith(".exr") else a.read_bytes() == b.read_bytes(), name
+
+
+def test_ctrl_c_keeps_what_is_done(unbroken, tmp_path):
+    process = _start(tmp_path, "--spp=1024")
+    _wait_for(tmp_path, 1)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and out == ""
+    assert err.startswith("warp-gi: interrupted: ") and err.count("\n") == 1
+    files = list(tmp_path.iterdir())
+    assert 1 <= len(files) < 8
+    assert all(sequence.is_whole(path) for path in files)
+
+
+def test_full_disk_is_one_line(unbroken, tmp_path):
+    pytest.importorskip("resource")
+    script = f"""
+import resource, sys
+from warp_gi.cli import main
+resource.setrlimit(resource.RLIMIT_FSIZE, (8000, 8000))
+sys.exit(main(["render", *{SMALL!r}, "--frames=0-3", "--quiet", "-o", "a.####.exr"]))
+"""
+    result = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
+    assert result.returncode == 2, result
+    assert result.stderr.startswith("warp-gi: error: cannot write a.0000.exr: ") and result.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a pseudo-terminal")
+def test_progress_bar_on_a_terminal(unbroken, tmp_path):
+    import pty
+
+    ours, theirs = pty.openpty()
+    command = [*COMMAND, "render", *SMALL, "--frames=0-2", "-o", tmp_path / "a.####.exr"]
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "120"}
+    with subprocess.Popen(command, stdout=theirs, stderr=subprocess.PIPE, env=environment) as process:
+        os.close(theirs)
+        shown = b""
+        while True:
+            try:
+                chunk = os.read(ours, 65536)
+            except OSError:
+                break
+            if not chunk:
+                break
+            shown += chunk
+        assert process.wait() == 0
+    os.close(ours)
+    assert b"3/3" in shown and b"left" in shown and b"[1/3]" not in shown
+
+
+def test_verbose_prints_stage_times(unbroken, tmp_path, capsys):
+    assert cli.main(["render", *SMALL, "--frames=0", "--verbose", "-o", str(tmp_path / "a.exr")]) == 0
+    printed = capsys.readouterr().out
+    assert "seconds by stage" in printed and "primary" in printed and "write" in printed
+
+
+def test_png_and_still_camera(unbroken, tmp_path):
+    view = ["--eye", "0", "1", "3", "--target", "0", "1", "0", "--hfov", "50"]
+    assert cli.main(["render", *SMALL, *view, "--quiet", "-o", str(tmp_path / "a.png")]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+
+
+BAD = [
+    (["rendr"], "unknown command 'rendr'; did you mean 'render'?"),
+    (["render", "cornel_box"], "unknown scene 'cornel_box'; did you mean 'cornell_box'?"),
+    (["render", "none.glb"], "none.glb"),
+    (["render", "cornell_box", "--pipeline", "pth"], "unknown pipeline 'pth'; did you mean 'path'?"),
+    (["render", "cornell_box", "--pipeline", "path,indirect=BsdfPath"], "did you mean 'BsdfPaths'?"),
+    (["render", "cornell_box", "--pipeline", "path,emitter=none"], "did you mean 'emitters'?"),
+    (["render", "cornell_box", "--camera", "none.json"], "none.json"),
+    (["render", "cornell_box", "--camera", "mian"], "unknown camera 'mian'; did you mean 'main'?"),
+    (["render", "cornell_box", "--eye", "0", "0", "0"], "--eye and --target go together"),
+    (["render", "cornell_box", "--hfov", "40"], "--hfov goes with a still camera"),
+    (["render", "cornell_box", "--frames", "3-1"], "frames '3-1' not understood"),
+    (["render", "cornell_box", "--resolution", "24"], "resolution '24' not understood"),
+    (["render", "cornell_box", "--device", "tpu"], "device 'tpu' is not available"),
+    (["render", "cornell_box", "--threads", "0"], "thread count must be"),
+    (["render", "cornell_box", "--seed", "-1"], "seed must be 0 or above"),
+    (["render", "cornell_box", "--frames", "0-1", "-o", "a.exr"], "put #### in the name"),
+    (["render", "cornell_box", "--frames", "0", "-o", "a.tif"], ".exr or .png"),
+    (["render", "cornell_box", "--frames", "0", "-o", "a.png", "--resume"], "--resume needs .exr"),
+    (["render", "cornell_box", "--environment", "1,2"], "1 or 3 numbers"),
+    (["render", "cornell_box", "--environment", "none.exr"], "none.exr"),
+    (["render", "cornell_box", "--environment-scale", "2"], "go with --environment"),
+    (["render", "cornell_box", "--frames", "0", "-o", "/dev/null/a.exr"], "/dev/null"),
+    (["compare", "a.exr", "b.exr"], "a.exr: no such file"),
+    (["info", "none.obj"], "none.obj"),
+    (["bench", "pth"], "unknown benchmark suite 'pth'; did you mean 'path'?"),
+]
+
+
+@pytest.mark.parametrize("arguments, words", BAD, ids=[" ".join(a) for a, _ in BAD])
+def test_mistakes_are_one_line(arguments, words, capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(arguments) == 2
+    error = capfd.readouterr().err
+    assert error.startswith("warp-gi: error: ") and error.count("\n") == 1 and "Traceback" not in error
+    assert words in error
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["render", "--resum"], "--resume"),
+        (["render", "--indirect.max-deph", "4"], "--indirect.max-depth"),
+        (["render", "--indirect.max-depth", "many"], "max-depth"),
+        (["render", "--indirect.max-depth", "1"], "max_depth must be at least 2"),
+        (["compare"], "IMAGE"),
+    ],
+)
+def test_wrong_options_name_the_nearest(arguments, words, capsys):
+    try:
+        code = cli.main(arguments)
+    except SystemExit as leaving:
+        code = leaving.code
+    error = capsys.readouterr().err
+    assert code == 2 and words in error and "Traceback" not in error
+
+
+def test_traceback_on_demand(monkeypatch):
+    monkeypatch.setenv("WARP_GI_DEBUG", "1")
+    with pytest.raises(ValueError, match="unknown scene"):
+        cli.main(["info", "cornel_box"])
+
+
+@pytest.mark.parametrize("command", ["", "render", "compare", "info", "bench"])
+def test_help(command, capsys):
+    try:
+        code = cli.main([command, "--help"] if command else ["--help"])
+    except SystemExit as leaving:
+        code = leaving.code or 0
+    printed = capsys.readouterr().out
+    assert code == 0 and "usage: warp-gi" in printed
+    if command == "render":
+        assert "--indirect.max-depth" in printed and "--spp" in printed and "warp-gi render hall.glb" in printed
+
+
+def test_version_and_no_command(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("warp-gi 0.")
+    assert cli.main([]) == 2
+
+
+def test_compare(unbroken, tmp_path, capsys):
+    a, b = unbroken / "a.0000.exr", unbroken / "a.0001.exr"
+    picture = tmp_path / "d.png"
+    assert cli.main(["compare", str(a), str(b), "-o", str(picture)]) == 0
+    printed = capsys.readouterr().out
+    assert all(word in printed for word in ("RMSE", "relMSE", "PSNR", "FLIP", "d.png"))
+    from PIL import Image
+
+    assert Image.open(picture).size == (72, 16)
+    assert cli.main(["compare", str(a), str(b), "-o", str(tmp_path / "d.exr"), "--layer", "albedo"]) == 0
+    difference = sequence.read_frame(tmp_path / "d.exr").numpy("beauty")
+    albedos = [sequence.read_frame(path).numpy("albedo") for path in (a, b)]
+    np.testing.assert_array_equal(difference, albedos[0] - albedos[1])
+    assert cli.main(["compare", *[str(unbroken / f"a.000{i}.png") for i in (0, 1)], "-o", str(picture)]) == 0
+
+
+def test_compare_refuses(unbroken, tmp_path, capsys):
+    small = tmp_path / "small.png"
+    write_png(small, np.zeros((4, 4, 3), np.uint8))
+    (tmp_path / "text.png").write_text("not a picture")
+    np.save(tmp_path / "objects.npy", np.array([{}]), allow_pickle=True)
+    exr, png = unbroken / "a.0000.exr", unbroken / "a.0000.png"
+    for a, b, extra, words in [
+        (small, png, [], "image is 4x4 with 3 channels and reference 24x16"),
+        (exr, png, [], "give two of a kind"),
+        (tmp_path / "text.png", png, [], "not a picture"),
+        (tmp_path / "objects.npy", exr, [], "not a NumPy array"),
+        (exr, exr, ["--layer", "shadow"], "no layer 'shadow'"),
+        (exr, exr, ["-o", "d.gif"], ".png or an .exr"),
+    ]:
+        assert cli.main(["compare", str(a), str(b), *extra]) == 2
+        error = capsys.readouterr().err
+        assert words in error and error.count("\n") == 1
+
+
+def test_info(capsys):
+    assert cli.main(["info", "cornell_box"]) == 0
+    printed = capsys.readouterr().out
+    assert all(word in printed for word in ("triangles", "36", "lowest corner", "materials", "cameras", "memory"))
+
+
+def test_bench_rows_as_json_lines(tmp_path, capsys):
+    from warp_gi.bench import runner
+
+    rows = [{"case": "a", "seconds": 1.5}, {"case": "b", "seconds": np.float32(2)}, {"other": 1}]
+    runner.print_rows("suite", rows)
+    assert capsys.readouterr().out.count("suite") == 2  # two sets of keys, two tables
+    runner.write_json_lines(tmp_path / "r.jsonl", "suite", rows, True, "cpu")
+    lines = [json.loads(line) for line in (tmp_path / "r.jsonl").read_text().splitlines()]
+    assert [line.get("seconds") for line in lines] == [1.5, 2.0, None]
+    assert all({"commit", "cpu", "warp-lang", "device", "quick", "suite"} <= set(line) for line in lines)
+
+
+def test_suites_are_modules_with_run(tmp_path):
+    from warp_gi.bench import runner
+
+    (tmp_path / "speed.py").write_text('"""Measures speed.\n\nMore."""\ndef run(quick, device):\n    return []\n')
+    (tmp_path / "helper.py").write_text('"""Helps."""\ndef other():\n    pass\n')
+    assert runner.suites(Path(tmp_path)) == {"speed": "Measures speed."}
+    assert "runner" not in runner.suites()
