@@ -9,8 +9,8 @@ import numpy as np
 from warp_gi.errors import SceneError
 from warp_gi.kernels import types
 from warp_gi.scene.geometry import FlatGeometry
-from warp_gi.scene.model import Material, Node, PunctualLight, Texture
-from warp_gi.scene.textures import LUMINANCE, linear_rgb
+from warp_gi.scene.model import Material, Node, PunctualLight
+from warp_gi.scene.textures import LUMINANCE, box_means, linear_rgb
 
 LIGHT_KINDS = {
     "point": types.EMITTER_POINT,
@@ -64,42 +64,11 @@ def emissive_triangles(flat: FlatGeometry, materials: Sequence[Material]) -> tup
         radiance = np.asarray(material.emission, np.float64)
         if material.emission_texture is not None:
             uvs = flat.uvs[flat.indices[triangles[mine]]]
-            radiance = radiance * mean_color(material.emission_texture, uvs.min(axis=1), uvs.max(axis=1))
+            texture = material.emission_texture
+            radiance = radiance * box_means(linear_rgb(texture), texture.wrap, uvs.min(axis=1), uvs.max(axis=1))
         powers[mine] *= radiance @ LUMINANCE * (2.0 if material.double_sided else 1.0)
     kept = powers > 0.0
     return triangles[kept], powers[kept]
-
-
-def mean_color(texture: Texture, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the mean linear colour of the texels that bilinear lookups in uv boxes can read, float64 [n, 3].
-
-    ``low`` and ``high`` are the corners of the boxes, [n, 2], v up. The mean is zero
-    only if all those texels are black.
-    """
-    image = linear_rgb(texture)[::-1].astype(np.float64)
-    boxes = []
-    for axis, size, wrap in ((1, image.shape[1], texture.wrap[0]), (0, image.shape[0], texture.wrap[1])):
-        begin = np.floor(low[:, 1 - axis].astype(np.float64) * size - 0.5) - 1.0
-        end = np.floor(high[:, 1 - axis].astype(np.float64) * size - 0.5) + 3.0
-        if wrap == "clamp":
-            begin, end = np.clip(begin, 0, size - 1), np.clip(end, 1, size)
-        else:
-            if wrap == "mirror":
-                image = np.concatenate([image, np.flip(image, axis)], axis)
-                size *= 2
-            image = np.concatenate([image, image], axis)
-            whole = end - begin >= size
-            begin, end = (
-                np.where(whole, 0, np.mod(begin, size)),
-                np.where(whole, size, np.mod(begin, size) + end - begin),
-            )
-        boxes.append((begin.astype(np.int64), end.astype(np.int64)))
-    (left, right), (bottom, top) = boxes
-    right, top = np.maximum(right, left + 1), np.maximum(top, bottom + 1)
-    sums = np.pad(image, ((1, 0), (1, 0), (0, 0))).cumsum(0).cumsum(1)
-    total = sums[top, right] - sums[bottom, right] - sums[top, left] + sums[bottom, left]
-    total[total < 1e-4] = 0.0  # rounding: the darkest code that is not black is 3e-4
-    return total / ((right - left) * (top - bottom))[:, None]
 
 
 def light_power(light: PunctualLight, radius: float) -> float:

@@ -86,7 +86,8 @@ def transform_points(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return ``points`` [n, 3] moved by ``matrix`` [4, 4], float32."""
     if np.array_equal(matrix, np.eye(4)):
         return np.asarray(points, np.float32)
-    return (np.asarray(points, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
+    with np.errstate(over="ignore"):  # infinite points are an error of the Scene
+        return (np.asarray(points, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
 
 
 def transform_normals(matrix: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -147,3 +148,11 @@ def place(flat: FlatGeometry, node: Node, matrix: np.ndarray, vertex: int) -> No
         if mesh.normals is not None:
             flat.normals[vertex:end] = transform_normals(matrix, mesh.normals)
         vertex = end
+
+
+def triangulated(faces: np.ndarray) -> np.ndarray:
+    """Return faces [n, corners] as a fan of triangles each, int64 [m, 3]."""
+    if faces.ndim != 2 or faces.shape[1] < 3:
+        raise SceneError(f"faces must have at least 3 corners, got shape {list(faces.shape)}")
+    fans = [faces[:, [0, corner, corner + 1]] for corner in range(1, faces.shape[1] - 1)]
+    return np.stack(fans, axis=1).reshape(-1, 3).astype(np.int64)

@@ -28,7 +28,7 @@ def split_glb(data: memoryview, path: Path) -> tuple[bytes, memoryview | None]:
         raise SceneError(f"{str(path)!r} is glTF version {version}; only version 2 is supported, export it again")
     if length > len(data):
         raise SceneError(
-            f"{str(path)!r} is truncated: it should have {length} bytes and has {len(data)}; copy it again"
+            f"{str(path)!r} is truncated: it should have {length} bytes, it has {len(data)}; copy it again"
         )
     text, binary = None, None
     at = 12

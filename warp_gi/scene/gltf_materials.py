@@ -71,7 +71,7 @@ class MaterialReader:
             texture = self.document.textures[info.index]
             if texture.source is None:
                 raise SceneError(
-                    f"{str(self.buffers.path)!r}: texture {info.index} of material {material!r} has no PNG or JPEG image"
+                    f"{str(self.buffers.path)!r}: texture {info.index} of material {material!r} has no image"
                 )
             wrap = ("repeat", "repeat")
             if texture.sampler is not None:

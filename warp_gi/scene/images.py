@@ -25,10 +25,12 @@ def find_file(folder: Path, name: str, what: str) -> Path:
     path = folder / name.replace("\\", "/")
     if path.is_file():
         return path
-    if path.parent.is_dir():
-        for candidate in path.parent.iterdir():
-            if candidate.name.lower() == path.name.lower() and candidate.is_file():
-                return candidate
+    found = folder
+    for part in Path(name.replace("\\", "/")).parts:
+        alike = [p for p in found.iterdir() if p.name.lower() == part.lower()] if found.is_dir() else []
+        found = found / (part if part == ".." or not alike else alike[0].name)
+    if found.is_file():
+        return found
     raise missing_file(path, what)
 
 

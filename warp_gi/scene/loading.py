@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from warp_gi.errors import OptionError, SceneError
+from warp_gi.scene.geometry import triangulated
 from warp_gi.scene.images import missing_file
 from warp_gi.scene.model import Material, Mesh, Node
 from warp_gi.scene.parts import SceneParts
@@ -46,8 +47,9 @@ def load_scene(
         raise
     except (ValueError, KeyError, IndexError, TypeError, AttributeError, EOFError, OSError, struct.error) as error:
         reason = " ".join(str(error).split())[:200]
+        kind = suffix[1:].upper()
         raise SceneError(
-            f"{str(path)!r} cannot be read as {suffix[1:].upper()} ({type(error).__name__}: {reason}); it may be damaged"
+            f"{str(path)!r} cannot be read as {kind} ({type(error).__name__}: {reason}); export or copy it again"
         ) from error
     if smooth is not None:
         parts = parts.smoothed(smooth)
@@ -92,11 +94,3 @@ def _read_single_mesh(path: Path, suffix: str) -> SceneParts:
         path.stem,
     )
     return SceneParts([Node(path.stem, [mesh])])
-
-
-def triangulated(faces: np.ndarray) -> np.ndarray:
-    """Return faces [n, corners] as a fan of triangles each, int64 [m, 3]."""
-    if faces.ndim != 2 or faces.shape[1] < 3:
-        raise SceneError(f"faces must have at least 3 corners, got shape {list(faces.shape)}")
-    fans = [faces[:, [0, corner, corner + 1]] for corner in range(1, faces.shape[1] - 1)]
-    return np.stack(fans, axis=1).reshape(-1, 3).astype(np.int64)

@@ -1,12 +1,13 @@
 """OBJ files: triangles through trimesh, materials by an own reader of MTL.
 
-How MTL becomes glTF's metallic-roughness: ``Kd`` (times ``map_Kd``) is the base colour,
-where a Kd of 0 0 0 beside a ``map_Kd`` counts as white, as its exporters meant it; ``Ks`` is the reflectance at normal incidence, so the specular factor is max(Ks) / 0.04, at
-most 1, and Ks 0 is pure Lambert; where every channel of Ks is above 0.25 and above Kd, and
-there is no ``map_Kd``, it is a metal of colour Ks. ``Ns`` is a Blinn-Phong exponent: the
-roughness is (2 / (Ns + 2))^(1/4), and its GGX alpha the square of that. ``Ke`` (times
-``map_Ke``) is emitted radiance. ``map_d`` (or ``d``) is coverage, cut at 0.5. ``norm`` is a
-normal map; ``bump`` maps hold heights and are ignored. Both sides emit.
+How MTL becomes glTF's metallic-roughness: ``Kd`` (times ``map_Kd``) is the base colour, where
+a Kd of 0 0 0 beside a ``map_Kd`` counts as white, as its exporters meant it. ``Ks`` is the
+reflectance at normal incidence, so the specular factor is max(Ks) / 0.04, at most 1, and Ks 0
+is pure Lambert; where every channel of Ks is above 0.25 and above Kd, and there is no
+``map_Kd``, it is a metal of colour Ks. ``Ns`` is a Blinn-Phong exponent: the roughness is
+(2 / (Ns + 2))^(1/4), and its GGX alpha the square of that. ``Ke`` (times ``map_Ke``) is
+emitted radiance. ``map_d`` (or ``d``) is coverage, cut at 0.5. ``norm`` is a normal map;
+``bump`` maps hold heights and are ignored. Both sides emit.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_gi.errors import SceneError
+from warp_gi.scene.geometry import triangulated
 from warp_gi.scene.images import find_file, read_image
 from warp_gi.scene.model import Material, Mesh, Node, Texture
 from warp_gi.scene.parts import SceneParts
@@ -67,7 +69,7 @@ def read_obj(path: Path) -> SceneParts:
         normals, uvs = geometry.get("vertex_normals"), getattr(visual, "uv", None)
         mesh = Mesh(
             np.asarray(geometry["vertices"], np.float32),
-            np.asarray(geometry["faces"]),
+            triangulated(np.asarray(geometry["faces"])),
             reader.material(material_name),
             None if normals is None else np.asarray(normals, np.float32),
             None if uvs is None or not len(uvs) else np.asarray(uvs, np.float32)[:, :2],

@@ -31,9 +31,10 @@ def smooth_mesh(mesh: Mesh, angle: float) -> Mesh:
     position = np.unique(np.asarray(mesh.points), axis=0, return_inverse=True)[1].reshape(-1)[indices].reshape(-1)
     normals = _corner_normals(position, np.repeat(face_normals, 3, axis=0), corner_angles.reshape(-1), angle)
 
-    # one vertex for all corners that had one and agree on the normal
+    # one vertex for all corners that had one (without uvs: one position) and agree on the normal
     steps = np.round((normals + 1.0) * NORMAL_STEPS).astype(np.int64)
-    key = ((indices.reshape(-1) * 1024 + steps[:, 0]) * 1024 + steps[:, 1]) * 1024 + steps[:, 2]
+    vertex = position if mesh.uvs is None else indices.reshape(-1)
+    key = ((vertex * 1024 + steps[:, 0]) * 1024 + steps[:, 1]) * 1024 + steps[:, 2]
     _, first, corner_vertex = np.unique(key, return_index=True, return_inverse=True)
     source = indices.reshape(-1)[first]
     return replace(

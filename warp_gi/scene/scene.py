@@ -250,7 +250,8 @@ class _DeviceScene:
     """The buffers of a scene on one device, and the pose they are in."""
 
     def __init__(self, scene: Scene, device: wp.Device) -> None:
-        from warp_gi.bvh import AlphaMasks, TriangleBvh
+        from warp_gi.bvh import TriangleBvh
+        from warp_gi.scene.masks import alpha_masks
 
         self.scene, self.device = scene, device
         self.world = self.previous_world = animation.world_matrices(scene.nodes, 0.0)
@@ -288,13 +289,8 @@ class _DeviceScene:
         low, high = scene.bounds
         data.center = wp.vec3(*(float(x) for x in (low.astype(np.float64) + high) / 2.0))
         data.radius = scene.radius
-        masks = textures.alpha_masks(scene.materials, images)
-        alpha = None
-        if masks:
-            mask_of = np.full(len(scene.materials), -1, np.int32)
-            mask_of[list(masks)] = np.arange(len(masks))
-            alpha = AlphaMasks(mask_of[flat.materials], list(masks.values()), flat.uvs, data.textures, data.texels)
-        self.bvh = TriangleBvh(data.geometry.points, data.geometry.indices, device=device, alpha=alpha)
+        masks = alpha_masks(flat, scene.materials, images, data.textures, data.texels)
+        self.bvh = TriangleBvh(flat.points, flat.indices, device=device.alias, alpha=masks)
         data.bvh = self.bvh.data
         self.data = data
         self.set_environment(scene.environment)
@@ -334,7 +330,7 @@ class _DeviceScene:
             self._upload(self.data.emitters.emitters, self.emitters, len(self.scene._emissive), len(self.emitters))
         self.world, self.previous_world = world, previous_world
         if moved:
-            self.bvh.refit(target.points)
+            self.bvh.refit(flat.points)
         return moved or changed
 
     def _upload(self, target: wp.array, source: np.ndarray, start: int, stop: int) -> None:

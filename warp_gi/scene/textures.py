@@ -97,16 +97,6 @@ def texture_table(textures: Sequence[Texture]) -> tuple[np.ndarray, np.ndarray]:
     return table, texels
 
 
-def alpha_masks(materials: Sequence[Material], textures: Sequence[Texture]) -> dict[int, tuple[int, float, float]]:
-    """Return (texture index or -1, alpha factor, cutoff) by the index of each masked material."""
-    index_of = {id(texture): index for index, texture in enumerate(textures)}
-    return {
-        index: (index_of.get(id(m.base_color_texture), -1), m.alpha, m.alpha_cutoff)
-        for index, m in enumerate(materials)
-        if m.alpha_cutoff is not None
-    }
-
-
 def material_table(materials: Sequence[Material], textures: Sequence[Texture]) -> np.ndarray:
     """Return the materials as an array with the dtype of types.Material; textures by their index in ``textures``."""
     index_of = {id(texture): index for index, texture in enumerate(textures)}
@@ -126,3 +116,46 @@ def linear_rgb(texture: Texture) -> np.ndarray:
     """Return float32 [height, width, 3], linear, row 0 at the top."""
     rgb = texture.pixels[..., :3]
     return SRGB_TO_LINEAR[rgb] if texture.srgb else rgb.astype(np.float32) / 255.0
+
+
+def box_means(image: np.ndarray, wrap: tuple[str, str], low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the means of the texels that bilinear lookups in uv boxes can read, float64 [n, channel].
+
+    ``image`` is [height, width, channel] with values from 0 to 1, row 0 at the top; ``low``
+    and ``high`` are the corners of the boxes, [n, 2], v up. One texel around is counted in.
+    Sums are exact integers (steps of 2^-24, rounded up), so a mean is zero only where every
+    lookup gives zero.
+    """
+    steps = np.ceil(image[::-1].astype(np.float64) * 2.0**24).astype(np.int64)
+    for axis, mode in ((1, wrap[0]), (0, wrap[1])):
+        if mode == "mirror":
+            steps = np.concatenate([steps, np.flip(steps, axis)], axis)
+    ranges = []
+    for axis, mode in ((1, wrap[0]), (0, wrap[1])):
+        size, texels = steps.shape[axis], image.shape[axis]
+        begin = np.floor(low[:, 1 - axis].astype(np.float64) * texels - 0.5) - 1.0
+        end = np.floor(high[:, 1 - axis].astype(np.float64) * texels - 0.5) + 3.0
+        if mode == "clamp":
+            begin, end = np.clip(begin, 0, size - 1), np.clip(end, 1, size)
+        else:
+            whole, wrapped = end - begin >= size, np.mod(begin, size)
+            begin, end = np.where(whole, 0, wrapped), np.where(whole, size, wrapped + end - begin)
+        ranges.append((begin.astype(np.int64), end.astype(np.int64)))
+    height, width = steps.shape[:2]
+    sums = np.zeros((height + 1, width + 1, steps.shape[2]), np.int64)
+    steps.cumsum(0, out=steps).cumsum(1, out=sums[1:, 1:])
+
+    def below(row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        """Return the sum over all rows and columns before these, with the image repeated once."""
+        (rows, row), (columns, column) = np.divmod(row, height), np.divmod(column, width)
+        rows, columns = rows[:, None], columns[:, None]
+        return (
+            sums[row, column]
+            + rows * sums[height, column]
+            + columns * sums[row, width]
+            + rows * columns * sums[height, width]
+        )
+
+    (left, right), (bottom, top) = ranges
+    total = below(top, right) - below(bottom, right) - below(top, left) + below(bottom, left)
+    return total / (2.0**24 * (right - left) * (top - bottom))[:, None]
