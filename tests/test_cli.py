@@ -179,6 +179,7 @@ def test_progress_bar_on_a_terminal(unbroken, tmp_path):
         assert process.wait() == 0
     os.close(ours)
     assert b"3/3" in shown and b"left" in shown and b"[1/3]" not in shown
+    assert b"compile warp_gi.kernels.path_trace" in shown or b"trace " in shown
 
 
 def test_verbose_prints_stage_times(unbroken, tmp_path, capsys):

@@ -11,6 +11,8 @@ from typing import Any
 
 import warp as wp
 
+from warp_gi import launch
+
 
 class Reporter:
     """Progress of a run on standard output.
@@ -69,9 +71,11 @@ class Reporter:
         )
         with Progress(*columns) as self._bar:
             self._task = self._bar.add_task("", total=total, left="")
+            launch.on_load = lambda module: self.stage(f"compile {module}", 0.0)
             try:
                 yield
             finally:
+                launch.on_load = None
                 self._bar.update(self._task, description="")
                 self._bar = None
 
@@ -79,7 +83,8 @@ class Reporter:
         """Show how far into the current frame the run is; called often, cheap."""
         if self._bar is not None:
             inside = share if name == "trace" else 0.0
-            self._bar.update(self._task, completed=self._done + 0.99 * inside, description=f"{name} {share:.0%}")
+            shown = f"{name} {share:.0%}" if share else name
+            self._bar.update(self._task, completed=self._done + 0.99 * inside, description=shown)
 
     def frame(self, text: str, seconds: float) -> None:
         """Report a finished frame that took ``seconds``, compilation apart."""

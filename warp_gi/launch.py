@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -30,6 +30,9 @@ _lock = threading.Lock()
 _threads: int | None = None
 compile_seconds = 0.0
 """Wall seconds this process has spent compiling or loading kernel modules."""
+on_load: Callable[[str], None] | None = None
+"""Called with a kernel module's name before its first launch, which may take seconds to compile; for progress."""
+_loaded: set[tuple[str, str]] = set()
 
 
 def thread_count() -> int:
@@ -76,6 +79,10 @@ def load(kernel: wp.Kernel, device: wp.Device) -> None:
     """Compile or load the kernel's module now, and add the time to ``compile_seconds``."""
     global compile_seconds
     started = time.perf_counter()
+    if (kernel.module.name, device.alias) not in _loaded:
+        _loaded.add((kernel.module.name, device.alias))
+        if on_load is not None:
+            on_load(kernel.module.name)
     with _lock:
         kernel.module.load(device, 1 if device.is_cpu else CUDA_BLOCK)
     compile_seconds += time.perf_counter() - started
