@@ -53,11 +53,16 @@ def print_rows(title: str, rows: Sequence[dict[str, Any]]) -> None:
         print_table(title, columns, [list(row.values()) for row in group])
 
 
-def write_json_lines(path: Path, suite: str, rows: Sequence[dict[str, Any]], quick: bool, device: str) -> None:
-    """Write each row as a line of JSON, with what is needed to repeat it."""
+def json_lines(suite: str, rows: Sequence[dict[str, Any]], quick: bool, device: str) -> str:
+    """Return each row as a line of JSON, with what is needed to repeat it."""
     common = {"suite": suite, "quick": quick, **environment(device)}
+    return "".join(json.dumps({**common, **row}, default=float) + "\n" for row in rows)
+
+
+def write_json_lines(path: Path, suite: str, rows: Sequence[dict[str, Any]], quick: bool, device: str) -> None:
+    """Write ``json_lines`` to a file; raises OSError."""
     with replacing(path) as part:
-        part.write_text("".join(json.dumps({**common, **row}, default=float) + "\n" for row in rows), encoding="utf-8")
+        part.write_text(json_lines(suite, rows, quick, device), encoding="utf-8")
 
 
 def environment(device: str) -> dict[str, Any]:

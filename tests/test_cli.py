@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 from warp_gi import cli, sequence
+from warp_gi.cli_render import stoppable
+from warp_gi.cli_report import Reporter
 from warp_gi.preview import write_png
 
 SMALL = ["cornell_box", "--resolution", "24x16", "--spp", "4"]
@@ -142,6 +144,25 @@ def test_ctrl_c_keeps_what_is_done(unbroken, tmp_path):
     files = list(tmp_path.iterdir())
     assert 1 <= len(files) < 8
     assert all(sequence.is_whole(path) for path in files)
+
+
+def test_a_swallowed_ctrl_c_is_remembered():
+    before = signal.getsignal(signal.SIGINT)
+    with stoppable() as stop:
+        assert not stop.is_set()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        assert stop.is_set()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_time_left():
+    report = Reporter(terminal=False)
+    with report.bar(5):
+        assert report.time_left() is None
+        report.frame("a", 2.0)
+        report.frame("b", 4.0)
+        assert report.time_left() == pytest.approx(9.0, abs=0.5)
 
 
 def test_full_disk_is_one_line(unbroken, tmp_path):

@@ -23,7 +23,7 @@ class Bench:
     quick: bool = False
     """Smaller inputs, for a first look; not for figures that anyone quotes."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
-    """Also write each row as a line of JSON, with commit, versions, processor and settings."""
+    """Also write each row as a line of JSON, with commit, versions, processor and settings; - prints the lines."""
     device: str = "cpu"
     """cpu, cuda or cuda:1."""
     threads: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: every core)")] = None
@@ -41,7 +41,9 @@ def main(arguments: Sequence[str]) -> int:
         launch.set_threads(options.threads)
     rows = runner.run_suite(options.suite, options.quick, options.device)
     runner.print_rows(options.suite, rows)
-    if options.json is not None:
+    if options.json == Path("-"):
+        print(runner.json_lines(options.suite, rows, options.quick, options.device), end="")
+    elif options.json is not None:
         runner.write_json_lines(options.json, options.suite, rows, options.quick, options.device)
         print(f"rows: {options.json}")
     return 0

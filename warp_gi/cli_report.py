@@ -29,6 +29,7 @@ class Reporter:
         self._task: Any = None
         self._total = self._done = 0
         self._seconds: list[float] = []
+        self._begin_frame()
 
     def line(self, text: str) -> None:
         """Print a line, above the bar if there is one."""
@@ -56,6 +57,7 @@ class Reporter:
     def bar(self, total: int) -> Iterator[None]:
         """Show progress over ``total`` frames while the block runs."""
         self._total, self._done, self._seconds = total, 0, []
+        self._begin_frame()
         if not self.terminal:
             yield
             return
@@ -84,26 +86,39 @@ class Reporter:
         if self._bar is not None:
             inside = share if name == "trace" else 0.0
             shown = f"{name} {share:.0%}" if share else name
-            self._bar.update(self._task, completed=self._done + 0.99 * inside, description=shown)
+            left = self.time_left(inside)
+            self._bar.update(
+                self._task,
+                completed=self._done + 0.99 * inside,
+                description=shown,
+                left="" if left is None else f"{_clock(left)} left",
+            )
 
     def frame(self, text: str, seconds: float) -> None:
         """Report a finished frame that took ``seconds``, compilation apart."""
         self._done += 1
         self._seconds.append(seconds)
+        self._begin_frame()
         left = self.time_left()
         if self._bar is not None:
-            shown = f"{_clock(left)} left" if left is not None else ""
-            self._bar.update(self._task, completed=self._done, left=shown)
+            self._bar.update(self._task, completed=self._done, left=f"{_clock(left or 0)} left")
         else:
             rest = f", {_clock(left)} left" if left else ""
             self.line(f"[{self._done}/{self._total}] {text}{rest}")
 
-    def time_left(self) -> float | None:
-        """Return an estimate of the seconds left: the mean of the last frames times the frames to go."""
-        if not self._seconds:
-            return None
-        recent = self._seconds[-8:]
-        return sum(recent) / len(recent) * (self._total - self._done)
+    def time_left(self, share: float = 0.0) -> float | None:
+        """Return an estimate of the seconds left, or None before there is one.
+
+        The mean of the last frames, or the ``share`` done of the first, times the frames to go; compilation apart.
+        """
+        inside = time.perf_counter() - self._frame_started - (launch.compile_seconds - self._compiled)
+        if self._seconds:
+            recent = self._seconds[-8:]
+            return max(sum(recent) / len(recent) * (self._total - self._done) - inside, 0.0)
+        return inside / share * (self._total - share) if share else None
+
+    def _begin_frame(self) -> None:
+        self._frame_started, self._compiled = time.perf_counter(), launch.compile_seconds
 
     def table(self, title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
         """Print a table; numbers are set to the right."""
