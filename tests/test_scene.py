@@ -224,6 +224,22 @@ def test_bad_scenes_are_one_clear_line(case):
     assert "\n" not in str(error.value)
 
 
+def test_only_triangles_with_holes_are_masked():
+    pixels = np.full((8, 8, 4), 255, np.uint8)
+    pixels[:4, :, 3] = 0  # the upper half is a hole
+    holed = Material("holed", base_color_texture=Texture("t", pixels, wrap=("clamp", "clamp")), alpha_cutoff=0.5)
+    solid = Material("solid", base_color_texture=holed.base_color_texture)
+    gone, there = (Material(alpha=alpha, alpha_cutoff=0.5) for alpha in (0.25, 0.75))
+    low, high = TRIANGLE_UVS * [1.0, 0.25], TRIANGLE_UVS
+    meshes = [
+        triangle(m, uvs=uv) for m, uv in ((holed, low), (holed, high), (solid, high), (gone, high), (there, high))
+    ]
+    bvh = Scene([Node("n", meshes)]).data("cpu").bvh
+    np.testing.assert_array_equal(bvh.face_masks.numpy(), [-1, 0, -1, 1, -1])
+    np.testing.assert_array_equal(bvh.masks.numpy()["texture"], [0, -1])
+    assert Scene([Node("n", [meshes[0], meshes[2]])]).data("cpu").bvh.face_masks is None
+
+
 HASH_SCENE = """
 import numpy as np
 from warp_gi.scene.model import Material, Mesh, Node, Texture

@@ -97,12 +97,19 @@ def test_obj_without_its_library_is_grey(tmp_path):
     assert {(m.base_color, m.specular) for m in scene.materials} == {((0.8, 0.8, 0.8), 0.0)}
 
 
+def test_latin_1_names(tmp_path):
+    path = write_quad(tmp_path)
+    for name, text in (("quad.obj", QUAD), ("quad.mtl", MTL)):
+        (tmp_path / name).write_bytes(text.replace("wood", "Möbel").encode("latin-1"))
+    assert gi.load_scene(path).materials[0].base_color_texture is not None
+
+
 BROKEN_OBJ = {
     "texture": (
         dict(mtl=MTL.replace("mask.png", "masc.png")),
         r"texture 'masc.png' of material 'leaf' .*masc.png' is missing; did you mean 'mask.png'",
     ),
-    "index": (dict(obj=QUAD.replace("f 1 2 5", "f 1 2 9")), "quad.obj' cannot be read as OBJ .*(bounds|range)"),
+    "index": (dict(obj=QUAD.replace("f 1 2 5", "f 1 2 9")), "a face names a vertex, .* out of range .*index 8"),
     "nan": (dict(obj=QUAD.replace("v 0 0 1", "v nan 0 1")), "of 3 vertices are not finite"),
     "no faces": (dict(obj="v 0 0 0\nv 1 0 0\n"), "holds no triangles"),
     "empty": (dict(obj=""), "holds no triangles"),

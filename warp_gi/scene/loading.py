@@ -18,6 +18,9 @@ from warp_gi.scene.scene import Scene
 
 EXTENSIONS = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
 
+DAMAGE = (ArithmeticError, AttributeError, EOFError, LookupError, NameError, OSError, TypeError, ValueError)
+"""What readers, trimesh's among them, raise on damaged files."""
+
 
 def load_scene(
     path: str | os.PathLike[str], environment: Any = None, smooth: float | None = None, scale: float = 1.0
@@ -45,7 +48,7 @@ def load_scene(
         parts = _read(path, suffix)
     except SceneError:
         raise
-    except (ValueError, KeyError, IndexError, TypeError, AttributeError, EOFError, OSError, struct.error) as error:
+    except (*DAMAGE, struct.error) as error:
         reason = " ".join(str(error).split())[:200]
         kind = suffix[1:].upper()
         raise SceneError(

@@ -40,7 +40,7 @@ def read_gltf(path: Path) -> SceneParts:
     """Read a .glb or .gltf file; raises SceneError."""
     data = path.read_bytes()
     text, binary = split_glb(memoryview(data), path) if path.suffix.lower() == ".glb" else (data, None)
-    document = GLTF2.from_json(text.decode("utf-8"), infer_missing=True)
+    document = GLTF2.from_json(text.decode("utf-8-sig"), infer_missing=True)
     unknown = sorted(set(document.extensionsRequired or ()) - KNOWN_EXTENSIONS)
     if unknown:
         raise SceneError(f"{str(path)!r} requires {', '.join(unknown)}, which is not supported; export it without")

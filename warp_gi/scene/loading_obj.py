@@ -12,6 +12,7 @@ emitted radiance. ``map_d`` (or ``d``) is coverage, cut at 0.5. ``norm`` is a no
 
 from __future__ import annotations
 
+import io
 import re
 import warnings
 from dataclasses import dataclass, field
@@ -42,26 +43,26 @@ def read_obj(path: Path) -> SceneParts:
     """Read an .obj file and the .mtl files it names, one node a material; raises SceneError."""
     from trimesh.exchange.obj import load_obj
 
-    text = path.read_bytes()
+    text = _read_text(path)
     statements: dict[str, _MtlMaterial] = {}
-    for library in re.findall(rb"^\s*mtllib\s+(.+?)\s*$", text, re.MULTILINE):
-        name = library.decode("utf-8", "replace")
+    for name in re.findall(r"^[ \t]*mtllib\s+(.+?)\s*$", text, re.MULTILINE):
         try:
             file = find_file(path.parent, name, f"{str(path)!r}: material library")
         except SceneError as error:
             warnings.warn(f"{error}; its materials become plain grey", stacklevel=3)
             continue
         statements.update(_read_mtl(file))
-    used = [n.decode("utf-8", "replace").strip() for n in re.findall(rb"^\s*usemtl\s+(.+)$", text, re.MULTILINE)]
-    names = list(dict.fromkeys(used))
+    names = list(dict.fromkeys(re.findall(r"^[ \t]*usemtl\s+(.+?)\s*$", text, re.MULTILINE)))
     unknown = [name for name in names if name not in statements]
     if unknown and statements:
         warnings.warn(f"{str(path)!r}: material {unknown[0]!r} is not in its library; plain grey", stacklevel=3)
-    del text
-
     reader = _MaterialReader(path, statements)
-    with path.open("rb") as file:
-        contents = load_obj(file, resolver=_NamesOnly(names))
+    try:
+        contents = load_obj(io.StringIO(text), resolver=_NamesOnly(names))
+    except IndexError as error:
+        raise SceneError(
+            f"{str(path)!r}: a face names a vertex, texture coordinate or normal that is out of range ({error})"
+        ) from error
     nodes = []
     for geometry_name, geometry in reversed(list(contents.get("geometry", {}).items())):
         visual = geometry.get("visual")
@@ -79,6 +80,15 @@ def read_obj(path: Path) -> SceneParts:
     return SceneParts(nodes)
 
 
+def _read_text(path: Path) -> str:
+    """Return the text of a file in UTF-8 or, failing that, Latin-1."""
+    data = path.read_bytes()
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
 class _NamesOnly:
     """Gives trimesh a library of bare material names, so that it groups faces and reads no textures."""
 
@@ -94,7 +104,7 @@ class _NamesOnly:
 def _read_mtl(path: Path) -> dict[str, _MtlMaterial]:
     materials: dict[str, _MtlMaterial] = {}
     current = _MtlMaterial()
-    for line in path.read_text("utf-8", "replace").splitlines():
+    for line in _read_text(path).splitlines():
         words = line.split("#")[0].split() if not line.lstrip().lower().startswith(("newmtl", "map_")) else line.split()
         if len(words) < 2:
             continue
