@@ -127,7 +127,9 @@ def trace_path(
         emitter_share = 1.0 - sky_share
         wants_sky = has_sky_map
         wants_emitter = scene.emitters.count > 0
-        u_select = sample_1d(index, seed, d)
+        u_select = float(0.0)
+        if has_sky_map or wants_emitter:
+            u_select = sample_1d(index, seed, d)
         if at_first:
             sky_share = 1.0
             emitter_share = 1.0
@@ -153,7 +155,10 @@ def trace_path(
                 r.indirect = r.indirect + wp.cw_mul(throughput, light)
 
         # BSDF sampling: ends a path at a light, or continues it
-        b = bsdf_sample(s.bsdf, wo, sample_1d(index, seed, d + 4), sample_2d(index, seed, d + 5))
+        u_lobe = float(0.0)
+        if s.bsdf.f90 > 0.0:
+            u_lobe = sample_1d(index, seed, d + 4)
+        b = bsdf_sample(s.bsdf, wo, u_lobe, sample_2d(index, seed, d + 5))
         wi = s.shading * b.wi
         if b.pdf <= 0.0 or wp.dot(wi, s.normal) <= 0.0:
             break
@@ -235,9 +240,9 @@ def trace_paths(
     indirect = wp.vec3(0.0, 0.0, 0.0)
     moment1 = wp.vec3(0.0, 0.0, 0.0)
     moment2 = wp.vec3(0.0, 0.0, 0.0)
+    first_index = pixel_sample_index(p[0], p[1], settings.first_sample, settings.sample_bits)
     for i in range(settings.sample_count):
-        index = pixel_sample_index(p[0], p[1], settings.first_sample + i, settings.sample_bits)
-        r = trace_path(scene, s, -direction, paths, index, seed)
+        r = trace_path(scene, s, -direction, paths, first_index + wp.uint32(i), seed)
         brightest = wp.max(r.indirect)
         if paths.clamp > 0.0 and brightest > paths.clamp:
             r.indirect = r.indirect * (paths.clamp / brightest)

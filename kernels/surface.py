@@ -4,12 +4,9 @@ import warp as wp
 
 from warp_gi.kernels.bsdf import Bsdf, make_bsdf
 from warp_gi.kernels.sampling import frame_of
-from warp_gi.kernels.types import WRAP_CLAMP, WRAP_MIRROR, SceneData
+from warp_gi.kernels.types import WRAP_CLAMP, WRAP_MIRROR, WRAP_REPEAT, SceneData
 
 wp.set_module_options({"enable_backward": False})
-
-WRAP_CLAMP_ = wp.constant(WRAP_CLAMP)
-WRAP_MIRROR_ = wp.constant(WRAP_MIRROR)
 
 
 # A point on a surface, seen from the side of `wo`.
@@ -24,19 +21,27 @@ class Surface:
     offset: wp.float32  # metres by which rays leave along `normal`
 
 
+# Texture coordinate in units of texels from the first texel's centre, folded to [-0.5, size - 0.5].
+@wp.func
+def texel_coordinate(u: wp.float32, size: wp.int32, mode: wp.int32) -> wp.float32:
+    folded = wp.clamp(u, 0.0, 1.0)
+    if mode == WRAP_MIRROR:
+        folded = wp.abs(u - 2.0 * wp.floor(0.5 * u + 0.5))
+    elif mode != WRAP_CLAMP:
+        folded = u - wp.floor(u)
+    return folded * wp.float32(size) - 0.5
+
+
+# Texel index of one in [-1, size].
 @wp.func
 def wrap_index(i: wp.int32, size: wp.int32, mode: wp.int32) -> wp.int32:
-    if mode == WRAP_CLAMP_:
-        return wp.clamp(i, 0, size - 1)
-    if mode == WRAP_MIRROR_:
-        k = i % (2 * size)
-        if k < 0:
-            k += 2 * size
-        return wp.min(k, 2 * size - 1 - k)
-    k = i % size
-    if k < 0:
-        k += size
-    return k
+    if mode == WRAP_REPEAT:
+        if i < 0:
+            return size - 1
+        if i >= size:
+            return 0
+        return i
+    return wp.clamp(i, 0, size - 1)
 
 
 @wp.func
@@ -55,11 +60,8 @@ def texel_color(scene: SceneData, index: wp.int32, srgb: wp.int32) -> wp.vec4:
 @wp.func
 def texture_lookup(scene: SceneData, texture: wp.int32, uv: wp.vec2) -> wp.vec4:
     t = scene.textures[texture]
-    # fract first: large repeats would lose the fraction in float32 anyway, and int32 must not overflow
-    x = uv[0] * wp.float32(t.width) - 0.5
-    y = uv[1] * wp.float32(t.height) - 0.5
-    x = wp.clamp(x, -1.0e9, 1.0e9)
-    y = wp.clamp(y, -1.0e9, 1.0e9)
+    x = texel_coordinate(uv[0], t.width, t.wrap_u)
+    y = texel_coordinate(uv[1], t.height, t.wrap_v)
     fx = x - wp.floor(x)
     fy = y - wp.floor(y)
     i = wp.int32(wp.floor(x))
