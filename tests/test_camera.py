@@ -4,6 +4,8 @@ import json
 
 import numpy as np
 import pytest
+from scene_tools import GlbBuilder
+
 from warp_gi.camera import Camera, CameraKey, CameraPath
 from warp_gi.errors import GiError, OptionError, SceneError
 
@@ -88,3 +90,23 @@ def test_bad_files_are_one_line(tmp_path, text, words):
 def test_missing_file(tmp_path):
     with pytest.raises(SceneError, match=r"nothing.json"):
         CameraPath.load(tmp_path / "nothing.json")
+
+
+def test_path_from_gltf_follows_the_camera_node(tmp_path):
+    glb = GlbBuilder()
+    lens = glb.add("cameras", {"type": "perspective", "perspective": {"yfov": 0.5, "aspectRatio": 2.0, "znear": 0.1}})
+    glb.add("nodes", {"name": "wall", "mesh": glb.mesh(glb.add("materials", {"name": "grey"}))})
+    glb.add("nodes", {"name": "view", "camera": lens})
+    samplers = [{"input": glb.accessor([0.0, 1.0]), "output": glb.accessor([[0, 0, 5], [2, 0, 5]])}]
+    glb.add(
+        "animations",
+        {"samplers": samplers, "channels": [{"sampler": 0, "target": {"node": 1, "path": "translation"}}]},
+    )
+    glb.json["scenes"] = [{"nodes": [0, 1]}]
+    glb.write(tmp_path / "moving.glb")
+    path = CameraPath.from_gltf(tmp_path / "moving.glb", fps=10)
+    assert path.frame_count == 11
+    assert np.allclose(path.camera(5).position, [1, 0, 5], atol=1e-5)
+    assert path.camera(5).hfov == pytest.approx(np.degrees(2 * np.arctan(2 * np.tan(0.25))))
+    with pytest.raises(OptionError, match="did you mean 'view'"):
+        CameraPath.from_gltf(tmp_path / "moving.glb", name="vie")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_gi.errors import OptionError, SceneError
+from warp_gi.errors import OptionError, SceneError, unknown_name
 
 Vec3 = tuple[float, float, float]
 
@@ -196,6 +196,30 @@ class CameraPath:
             eye = (cx + radius * math.sin(angle), cy + height, cz + radius * math.cos(angle))
             keys.append(CameraKey(seconds * i / (count - 1), eye, (cx, cy, cz), hfov=hfov))
         return cls(tuple(keys), fps, resolution)
+
+    @classmethod
+    def from_gltf(cls, path: str | Path, name: str | None = None, fps: float = 24.0) -> CameraPath:
+        """Return the path of a camera in a glTF or GLB file, one key a frame over the animation of its node.
+
+        ``name`` None is the file's first camera. Raises SceneError if the file has no camera, OptionError if it
+        has none of that name.
+        """
+        from warp_gi.scene.loading import load_scene
+
+        scene = load_scene(path)
+        if not scene.cameras:
+            raise SceneError(f"{path}: expected a glTF camera, found none; give a JSON camera path instead")
+        if name is None:
+            name = next(iter(scene.cameras))
+        if name not in scene.cameras:
+            raise unknown_name("camera", name, scene.cameras)
+        camera = scene.cameras[name]
+        node = scene.camera_nodes.get(name)
+        if node is None:
+            return cls.still(camera)
+        frames = range(math.floor(scene.duration * fps + 1e-6) + 1)
+        poses = [replace(camera, world_from_camera=scene.world_from_node(node, i / fps)) for i in frames]
+        return cls.from_cameras(poses, fps=fps)
 
     @classmethod
     def load(cls, path: str | Path) -> CameraPath:
