@@ -46,7 +46,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", help=f"default: all of {', '.join(PRESETS)}")
     parser.add_argument("--renderings", type=int, default=64)
-    parser.add_argument("--spp", type=int, default=512, help="samples a pixel of each rendering")
+    parser.add_argument("--spp", type=int, default=256, help="samples a pixel of each rendering")
     parser.add_argument("--output", type=Path, default=FOLDER)
     options = parser.parse_args()
     for name in options.names or PRESETS:

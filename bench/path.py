@@ -58,23 +58,9 @@ _lit_room, _open_room = partial(presets.living_room, lamp=True), partial(presets
 
 CASES = (
     Case("Sponza, white sky, depth 4", _white_sponza, presets.SPONZA_VIEW, 4, _SPONZA, _path(4)),
-    Case(
-        "living room, lamp, depth 4",
-        lambda: presets.living_room(True),
-        presets.LIVING_ROOM_VIEW,
-        4,
-        _LIVING_ROOM,
-        _path(4),
-    ),
+    Case("living room, lamp, depth 4", _lit_room, presets.LIVING_ROOM_VIEW, 4, _LIVING_ROOM, _path(4)),
     Case("Sponza, white sky, direct", _white_sponza, presets.SPONZA_VIEW, 2, _SPONZA, _BSDF_ONLY),
-    Case(
-        "living room, white sky, direct",
-        lambda: presets.living_room(False),
-        presets.LIVING_ROOM_VIEW,
-        2,
-        _LIVING_ROOM,
-        _BSDF_ONLY,
-    ),
+    Case("living room, white sky, direct", _open_room, presets.LIVING_ROOM_VIEW, 2, _LIVING_ROOM, _BSDF_ONLY),
     Case(
         "Sponza, courtyard sky, direct",
         partial(presets.sponza, presets.SCENES / _COURTYARD),

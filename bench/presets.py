@@ -35,11 +35,13 @@ class Preset:
         return ", ".join(str(SCENES / name) for name in self.files if not (SCENES / name).exists())
 
 
-def peer_scene(scene: gi.Scene, diffuse: bool, flat: bool = True, masks: bool = True) -> gi.Scene:
+def peer_scene(
+    scene: gi.Scene, diffuse: bool, flat: bool = True, masks: bool = True, emission: bool = True
+) -> gi.Scene:
     """Return ``scene`` without normal maps, emission on one side only.
 
     ``diffuse`` makes every material Lambert of the same base colour, ``flat`` drops the
-    vertex normals, ``masks=False`` makes alpha-masked materials opaque.
+    vertex normals, ``masks=False`` makes alpha-masked materials opaque, ``emission=False`` dark.
     """
     materials: dict[int, gi.Material] = {}
 
@@ -49,7 +51,7 @@ def peer_scene(scene: gi.Scene, diffuse: bool, flat: bool = True, masks: bool = 
             if diffuse:
                 changes |= {"specular": 0.0, "metallic": 0.0, "roughness": 1.0, "metallic_roughness_texture": None}
             if any(material.emission):
-                changes["double_sided"] = False
+                changes |= {"double_sided": False} if emission else {"emission": (0.0, 0.0, 0.0)}
             if not masks:
                 changes["alpha_cutoff"] = None
             materials[id(material)] = replace(material, **changes)
@@ -101,12 +103,12 @@ def sponza(environment: object) -> gi.Scene:
 
 
 def living_room(lamp: bool) -> gi.Scene:
-    """The living room: lit by a square lamp under its ceiling and its own back light, or by a white sky as well."""
+    """The living room, lit by a square lamp under its ceiling and its own back light, or by nothing but a white sky."""
     scene = gi.load_scene(SCENES / "living_room" / "living_room.obj", environment=None if lamp else (1.0, 1.0, 1.0))
     if lamp:
         mesh = quad((-0.9, 2.95, 1.6), (0.8, 0.0, 0.0), (0.0, 0.0, 0.8), light((14.0, 11.0, 8.0)), "lamp")
         scene = gi.Scene([*scene.nodes, gi.Node("lamp", [mesh])], scene.lights, None, scene.cameras, scene.name)
-    return peer_scene(scene, diffuse=True)
+    return peer_scene(scene, diffuse=True, emission=lamp)
 
 
 def spheres(environment: object) -> gi.Scene:
