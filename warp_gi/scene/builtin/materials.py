@@ -79,13 +79,12 @@ def limestone() -> Material:
     return textured("limestone", color, 0.78, 0.0012 * tx.noise(43, 1.0, 6, 120), 2.0)
 
 
-def plaster() -> Material:
-    """Return old lime plaster, warm and mottled, over 3 m."""
-    mottle = tx.smoothstep(-2.0, 2.0, tx.noise(51, 1.6, 1) + 0.5 * tx.noise(52, 1.0, 5))
-    color = tx.blend((0.74, 0.565, 0.36), (0.63, 0.445, 0.255), mottle)
-    faded = tx.smoothstep(0.6, 1.6, tx.noise(53, 1.5, 2))
-    color = tx.blend(color, (0.73, 0.62, 0.46), 0.55 * faded)
-    return textured("plaster", color, 0.95, 0.0012 * tx.noise(54, 1.3, 3, 120), 3.0)
+def plaster(name: str, color: Color, worn: Color, seed: int) -> Material:
+    """Return old lime plaster, mottled and faded, over 3 m."""
+    mottle = tx.smoothstep(-2.0, 2.0, tx.noise(seed, 1.6, 1) + 0.5 * tx.noise(52, 1.0, 5))
+    base = tx.blend(color, np.multiply(color, (0.82, 0.76, 0.70)), mottle)
+    faded = tx.smoothstep(-0.5, 2.5, tx.noise(seed + 1, 1.5, 2) + 0.2 * tx.noise(52, 1.0, 5))
+    return textured(name, tx.blend(base, worn, 0.75 * faded), 0.95, 0.0012 * tx.noise(54, 1.3, 3, 120), 3.0)
 
 
 def white_marble() -> Material:
@@ -102,7 +101,7 @@ def rose_marble() -> Material:
 
 def walnut() -> Material:
     """Return waxed dark planks that run along u, 4 over 1.2 m."""
-    color, height = tx.wood((0.075, 0.035, 0.017), (0.23, 0.115, 0.055), seed=81)
+    color, height = tx.wood((0.11, 0.055, 0.027), (0.31, 0.165, 0.08), seed=81)
     return textured("walnut", color, 0.45, 0.003 * height, 1.2)
 
 

@@ -312,17 +312,25 @@ def ribbon_ring(profile: Sequence[Sequence[float]], half_x: float, half_z: float
     return (shape if inward else shape.flipped()).box_mapped()
 
 
-def cloth(width: float, height: float, columns: int = 32, rows: int = 24, seed: int = 0, folds: float = 0.06) -> Shape:
-    """Return hanging cloth, open, from (0, 0, 0) down to y = -height and along x, with folds deepening downwards."""
+def cloth_grid(
+    width: float, height: float, columns: int = 32, rows: int = 24, seed: int = 0, folds: float = 0.06
+) -> np.ndarray:
+    """Return points [rows + 1, columns + 1, 3] of cloth that hangs from y = 0 to -height, spread along x around 0.
+
+    Folds run down the cloth, and deepen downwards to about ``folds`` metres.
+    """
     rng = np.random.default_rng(seed)
     s, t = np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     waves = [(f, rng.uniform(0, 2 * math.pi), a) for f, a in ((3.0, 1.0), (5.0, 0.6), (8.0, 0.35))]
     depth = sum(a * np.sin(2 * math.pi * f * s * width / 1.6 + p + 0.8 * np.sin(3 * t + p)) for f, p, a in waves)
-    z = folds * depth * (0.35 + 0.65 * t)
     x = (s - 0.5) * width * (1 - 0.06 * np.sin(math.pi * t) ** 2)
-    grid = np.stack([x, -height * t, z], axis=-1)
-    uvs = np.stack([s * width, -t * height], axis=-1)
-    return loft(grid, uvs, crease=180.0)
+    return np.stack([x, -height * t, folds * depth * (0.35 + 0.65 * t)], axis=-1)
+
+
+def cloth(width: float, height: float, columns: int = 32, rows: int = 24, seed: int = 0, folds: float = 0.06) -> Shape:
+    """Return ``cloth_grid`` as an open surface that faces +z, its texture upright."""
+    u, v = np.meshgrid(np.linspace(0, width, columns + 1), np.linspace(0, -height, rows + 1))
+    return loft(cloth_grid(width, height, columns, rows, seed, folds), np.stack([u, v], axis=-1), crease=180.0)
 
 
 def volume(shape: Shape) -> float:

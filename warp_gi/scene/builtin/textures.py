@@ -11,6 +11,11 @@ import numpy as np
 from warp_gi.scene.model import Color, Texture
 
 SIZE = 512  # pixels
+_LINEAR = np.linspace(0, 1, 16384)
+SRGB_CODES = np.round(
+    255 * np.where(_LINEAR <= 0.0031308, 12.92 * _LINEAR, 1.055 * _LINEAR ** (1 / 2.4) - 0.055)
+).astype(np.uint8)
+"""uint8 [16384]: sRGB codes of linear values from 0 to 1."""
 
 
 @cache
@@ -20,12 +25,17 @@ def noise(seed: int, slope: float = 1.5, low: float = 1.0, high: float = 1e9, st
     Its amplitude falls with frequency^-slope between ``low`` and ``high`` cycles a texture. ``stretch`` above 1
     draws it out along x.
     """
-    spectrum = np.fft.rfft2(np.random.default_rng(seed).standard_normal((SIZE, SIZE)))
-    y, x = np.fft.fftfreq(SIZE, 1 / SIZE)[:, None], np.fft.rfftfreq(SIZE, 1 / SIZE)[None]
+    half = SIZE // 2 + 1
+    parts = np.random.default_rng(seed).standard_normal((2, SIZE, half), dtype=np.float32)
+    spectrum = parts[0] + np.complex64(1j) * parts[1]
+    y = np.fft.fftfreq(SIZE, 1 / SIZE)[:, None].astype(np.float32)
+    x = np.arange(half, dtype=np.float32)[None]
     frequency = np.hypot(x * stretch, y)
-    spectrum *= np.where((frequency >= low) & (frequency <= high), np.maximum(frequency, 1e-3) ** -slope, 0.0)
-    result = np.fft.irfft2(spectrum, (SIZE, SIZE))
-    result = ((result - result.mean()) / result.std()).astype(np.float32)
+    inside = (frequency >= low) & (frequency <= high)
+    spectrum[~inside] = 0
+    spectrum[inside] *= frequency[inside] ** np.float32(-slope)
+    result = np.fft.irfft2(spectrum, (SIZE, SIZE)).astype(np.float32)
+    result = (result - result.mean()) / result.std()
     result.setflags(write=False)
     return result
 
@@ -42,41 +52,46 @@ def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
 
 
 def blend(a: Sequence[float] | np.ndarray, b: Sequence[float] | np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return colours [.., 3] between a and b."""
-    return np.asarray(a) + (np.asarray(b) - np.asarray(a)) * weight[..., None]
+    """Return float32 colours [.., 3] between a and b."""
+    a, b = np.asarray(a, np.float32), np.asarray(b, np.float32)
+    return a + (b - a) * weight[..., None].astype(np.float32)
 
 
 def color_texture(name: str, linear: np.ndarray) -> Texture:
     """Return linear reflectances [h, w, 3] as an sRGB texture."""
-    x = np.clip(linear, 0.0, 1.0)
-    coded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-    return Texture(name, _rgba(coded))
+    return Texture(name, _rgba(SRGB_CODES[(np.clip(linear, 0.0, 1.0) * (len(SRGB_CODES) - 1)).astype(np.int32)]))
 
 
 def roughness_texture(name: str, roughness: np.ndarray, metallic: float = 0.0) -> Texture:
     """Return perceptual roughness [h, w] as a glTF metallic-roughness texture."""
-    return Texture(name, _rgba(np.stack(np.broadcast_arrays(1.0, roughness, metallic), axis=-1)), srgb=False)
+    channels = np.stack(np.broadcast_arrays(np.float32(1.0), roughness, np.float32(metallic)), axis=-1)
+    return Texture(name, _rgba(_bytes(channels)), srgb=False)
 
 
 def normal_texture(name: str, height: np.ndarray, size: float) -> Texture:
     """Return the normal map of a height field [h, w] in metres that spans ``size`` metres."""
-    texel = size / height.shape[1]
+    texel = np.float32(size / height.shape[1])
+    height = height.astype(np.float32)
     du = (np.roll(height, -1, 1) - np.roll(height, 1, 1)) / (2 * texel)
     dv = (np.roll(height, 1, 0) - np.roll(height, -1, 0)) / (2 * texel)  # row 0 is the top
     normal = np.stack([-du, -dv, np.ones_like(du)], axis=-1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    return Texture(name, _rgba(normal * 0.5 + 0.5), srgb=False)
+    return Texture(name, _rgba(_bytes(normal * 0.5 + 0.5)), srgb=False)
 
 
-def _rgba(values: np.ndarray) -> np.ndarray:
-    pixels = np.full((*values.shape[:2], 4), 255, np.uint8)
-    pixels[..., :3] = np.round(np.clip(values, 0, 1) * 255)
+def _bytes(values: np.ndarray) -> np.ndarray:
+    return (np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def _rgba(rgb: np.ndarray) -> np.ndarray:
+    pixels = np.full((*rgb.shape[:2], 4), 255, np.uint8)
+    pixels[..., :3] = rgb
     return pixels
 
 
 def cells(columns: int, rows: int, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return for a grid of bricks, every other row shifted: distance to the edge in pixels, and (row, column)."""
-    y, x = np.indices((SIZE, SIZE)) + 0.5
+    y, x = np.indices((SIZE, SIZE)).astype(np.float32) + 0.5
     row = (y * rows / SIZE).astype(int)
     along = (x * columns / SIZE + shift * (row % 2)) % columns
     column = along.astype(int)
@@ -102,10 +117,13 @@ def tiles(
     edge, row, column = cells(*count, shift=shift)
     edge = edge + 0.8 * noise(seed + 1, 1.0, 8)
     which = (row + column) % len(colors)
-    tint = 1 + variation * rng.standard_normal((count[1], count[0]))[row, column]
+    tint = 1 + variation * rng.standard_normal((count[1], count[0])).astype(np.float32)[row, column]
     offset = rng.integers(0, SIZE, (2, count[1], count[0]))
     grain = warped(noise(seed + 2, 1.4, 2), offset[0][row, column], offset[1][row, column])
-    face = np.asarray(colors)[which] * (tint * (1 + 0.10 * grain) * (1 + 0.05 * noise(seed + 3, 0.4, 16)))[..., None]
+    face = (
+        np.asarray(colors, np.float32)[which]
+        * (tint * (1 + 0.10 * grain) * (1 + 0.05 * noise(seed + 3, 0.4, 16)))[..., None]
+    )
     height = smoothstep(joint_width * 0.5, joint_width * 0.5 + 4.0, edge)
     return blend(joint, face, smoothstep(0.0, 1.0, height * 2)), height, edge
 
