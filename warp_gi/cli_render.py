@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 import tempfile
 import threading
 import time
@@ -10,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -194,18 +195,16 @@ def run(options: Render, report: Reporter) -> None:
     if len(todo) < len(shots):
         report.line(f"{len(shots) - len(todo)} of {len(shots)} frames are there already")
     started = time.perf_counter()
-    done: list[Shot] = []
     times: dict[str, list[float]] = {}
     try:
         with stoppable() as stop, report.bar(len(todo)):
             for shot in todo:
                 for stage, seconds in render_shot(options, shot, scheduler, report).items():
                     times.setdefault(stage, []).append(seconds)
-                done.append(shot)
                 if stop.is_set():
                     raise KeyboardInterrupt
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"{len(done)} of {len(todo)} frames written; --resume renders the others") from None
+        raise KeyboardInterrupt("finished frames are kept, --resume renders the others") from None
     count = f"{len(todo)} frame{'s' * (len(todo) != 1)}"
     report.line(f"{count} in {time.perf_counter() - started:.1f} s: {options.output}")
     if options.verbose and todo:
@@ -231,7 +230,7 @@ def render_shot(options: Render, shot: Shot, scheduler: FrameScheduler, report: 
 
 @contextmanager
 def stoppable() -> Iterator[threading.Event]:
-    """Yield an event that Ctrl-C sets, besides raising KeyboardInterrupt, which a callback or finaliser may swallow."""
+    """Yield an event that Ctrl-C sets, besides raising KeyboardInterrupt, which a finaliser may swallow."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stop
@@ -241,11 +240,17 @@ def stoppable() -> Iterator[threading.Event]:
         stop.set()
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGINT, interrupt)
+    def unraisable(report: Any) -> None:
+        if not issubclass(report.exc_type, KeyboardInterrupt):
+            hook(report)
+
+    hook, sys.unraisablehook = sys.unraisablehook, unraisable
+    handler = signal.signal(signal.SIGINT, interrupt)
     try:
         yield stop
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, handler)
+        sys.unraisablehook = hook
 
 
 def plan(options: Render, camera: Camera | CameraPath) -> list[Shot]:
