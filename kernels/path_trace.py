@@ -33,6 +33,7 @@ class PathSettings:
     terms: wp.int32  # TERM_* to estimate
     max_depth: wp.int32  # edges of the longest path, camera to light: 2 is direct light
     roulette_depth: wp.int32  # depth from which paths end at random
+    sky_probability: wp.float32  # of sampling the sky, not an emitter, where a vertex samples one of the two
     clamp: wp.float32  # largest component of a path's indirect radiance; 0: no limit
 
 
@@ -52,16 +53,6 @@ class PathBuffers:
     indirect: wp.array(dtype=wp.vec3)
     moment1: wp.array(dtype=wp.vec3)  # of the samples of beauty
     moment2: wp.array(dtype=wp.vec3)  # of their squares
-
-
-# Probability of sampling the sky, not an emitter, where a vertex samples one of the two.
-@wp.func
-def sky_probability(scene: SceneData) -> wp.float32:
-    if scene.environment.kind != ENVIRONMENT_MAP:
-        return 0.0
-    if scene.emitters.count == 0:
-        return 1.0
-    return 0.5
 
 
 # Light sample of the sky, weighted; `share` is the probability that it is taken.
@@ -123,7 +114,7 @@ def trace_path(
         d = 1 + (depth - 2) * DIMENSIONS
         wo = wp.transpose(s.shading) * view
         # light sampling: both strategies at the first vertex, where they are two terms; else one of them
-        sky_share = sky_probability(scene)
+        sky_share = paths.sky_probability
         emitter_share = 1.0 - sky_share
         wants_sky = has_sky_map
         wants_emitter = scene.emitters.count > 0

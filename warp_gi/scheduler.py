@@ -278,6 +278,7 @@ class FrameScheduler:
             paths.max_depth = frame._paths.max_depth
             paths.roulette_depth = frame._paths.roulette_depth
             paths.clamp = frame._paths.clamp
+            paths.sky_probability = _sky_probability(self.scene)
             buffers = frame._struct(path_trace.PathBuffers)
             frame.launch_tiled(
                 path_trace.trace_paths, [frame.data, frame.camera_data, settings, paths, frame.hits, buffers]
@@ -331,6 +332,21 @@ def camera_data(camera: Camera) -> gbuffer.CameraData:
     data.forward = wp.vec3(*-back)
     data.width, data.height = width, height
     return data
+
+
+def _sky_probability(scene: Scene) -> float:
+    """Return how often a path vertex samples the sky rather than an emitter: by power, but neither under a fifth.
+
+    A sky sends pi radius^2 times its integral over the sphere into the scene; walls keep most of that out of a room.
+    """
+    environment = scene.environment
+    if environment is None or environment.pixels is None:
+        return 0.0
+    if scene.emitter_count == 0:
+        return 1.0
+    sky = 4.0 * math.pi**2 * scene.radius**2 * float(environment.mean_radiance @ (0.2126, 0.7152, 0.0722))
+    emitters = float(scene.emitter_powers().sum())
+    return min(max(sky / max(sky + emitters, 1e-30), 0.2), 0.8)
 
 
 def _copied(source: Any, struct: Any) -> Any:
