@@ -129,7 +129,7 @@ BINARY = """
         }
 
         // Writes the node over a task's references; splits them and returns their middle, or 0 for a leaf.
-        static int node(Reference* refs, Reference* nodes, const Task& task) {
+        static int node(Reference* refs, Reference* nodes, float* surface, const Task& task) {
             f4 l = refs[task.begin].low, h = refs[task.begin].high, first = xyz(l) + h, last = first;
             for (int i = task.begin + 1; i < task.end; ++i) {
                 const f4 center = xyz(refs[i].low) + refs[i].high;
@@ -142,6 +142,7 @@ BINARY = """
             else if (count > 2 && task.depth > DEEP) middle = task.begin + count / 2;
             else if (count > 2 && count <= SWEEP) middle = sweep(refs, task.begin, task.end);
             else if (count > 2) middle = bin(refs, task.begin, task.end, first, last);
+            if (!middle) surface[8ll * task.base + 7] = refs[task.begin].high[3];
             nodes[task.base].low = with_word(l, count == 1 ? word(refs[task.begin].low) : count);
             nodes[task.base].high = with_word(h, middle ? middle - task.begin : 0);
             return middle;
@@ -160,7 +161,8 @@ BINARY = """
             const int left_count = word(nodes[n].high);
             const float area = half_area(nodes[n].low, nodes[n].high);
             if (!left_count) {
-                for (int i = 0; i < 8; ++i) costs[i] = area * BLOCK_COST, choice[i] = 0;
+                for (int i = 0; i < 7; ++i) costs[i] = area * BLOCK_COST;
+                for (int i = 0; i < 8; ++i) choice[i] = 0;
                 return;
             }
             const float* left = all_costs + 8ll * (n + 1);
@@ -171,13 +173,14 @@ BINARY = """
                     const float c = left[k - 1] + right[roots - k - 1];
                     if (c < best) best = c, choice[roots - 1] = (unsigned char)k;
                 }
-                costs[roots - 1] = best;
+                costs[roots - 1] = best;  // that of 8 roots only until the surface takes its place
             }
             const int count = word(nodes[n].low);
             const float block = count <= 4 ? area * BLOCK_COST : 3.4e38f, inner = area * NODE_COST + costs[7];
             choice[0] = inner < block;
             costs[0] = inner < block ? inner : block;
-            for (int i = 1; i < 8; ++i) if (!(costs[i] < costs[i - 1])) costs[i] = costs[i - 1], choice[i] = i == 7 ? choice[i] : 0;
+            costs[7] = left[7] + right[7];
+            for (int i = 1; i < 7; ++i) if (!(costs[i] < costs[i - 1])) costs[i] = costs[i - 1], choice[i] = 0;
         }
     };
 """.replace("NODE_COST", f"{NODE_COST}f").replace("BLOCK_COST", f"{BLOCK_COST}f")
@@ -195,7 +198,7 @@ SPLIT_TOP = (
     while (waiting) {
         const Task task = stack[--waiting];
         if (task.end - task.begin <= largest || task_count + waiting + 2 > most) { list[task_count++] = task; continue; }
-        const int middle = Builder::node(references, tree, task);
+        const int middle = Builder::node(references, tree, costs.data, task);
         top.data[top_count++] = task.base;
         Builder::children(task, middle, stack[waiting + 1], stack[waiting]);
         waiting += 2;
@@ -215,7 +218,7 @@ BUILD_SUBTREE = (
     stack[waiting++] = subtree;
     while (waiting) {
         const Task task = stack[--waiting];
-        const int middle = Builder::node((Reference*)refs.data, tree, task);
+        const int middle = Builder::node((Reference*)refs.data, tree, costs.data, task);
         if (!middle) continue;
         Builder::children(task, middle, stack[waiting + 1], stack[waiting]);
         waiting += 2;
@@ -233,8 +236,9 @@ WIDEN = (
     const bool dry = counts.data[2] < 0;  // the first call only counts
     if (dry) for (int i = counts.data[1] - 1; i >= 0; --i) Builder::cost(tree, costs.data, choices.data, top.data[i]);
     Item stack[1024];
-    int waiting = 0, wide_count = 1, block_count = 0;
+    int waiting = 0, wide_count = 1, block_count = 1;  // block 0 is empty
     stack[waiting++] = {0, 0};
+    if (!dry) for (int lane = 36; lane < 40; ++lane) ((int*)blocks.data)[lane] = -1;
     while (waiting) {
         const Item item = stack[--waiting];
         int pending[8], budget[8], pending_count = 0, child_count = 0;
@@ -246,7 +250,8 @@ WIDEN = (
         } else {
             pending[0] = item.node, budget[0] = 1, pending_count = 1;
         }
-        unsigned* wide_node = wide.data + 32ll * item.wide;
+        int roots_found[8];
+        float rank[8];
         while (pending_count) {
             const int n = pending[--pending_count];
             int roots = budget[pending_count];
@@ -255,28 +260,36 @@ WIDEN = (
             if (roots > 1) {
                 pending[pending_count] = n + 2 * Builder::word(tree[n].high), budget[pending_count++] = roots - choice[roots - 1];
                 pending[pending_count] = n + 1, budget[pending_count++] = choice[roots - 1];
-            } else if (choice[0]) {
-                if (!dry) wide_node[24 + child_count] = wide_count;
-                stack[waiting++] = {n, wide_count++};
-                ++child_count;
-            } else {
-                if (!dry) {
-                    wide_node[24 + child_count] = ~block_count;
-                    int* faces = (int*)blocks.data + 40ll * block_count + 36;
-                    int lanes = 0;
-                    const int left = Builder::word(tree[n].high), last = left ? n + 2 * Builder::word(tree[n].low) - 2 : n;
-                    for (int m = n; m <= last; ++m)
-                        if (!Builder::word(tree[m].high)) faces[lanes++] = Builder::word(tree[m].low);
-                    while (lanes < 4) faces[lanes++] = -1;
-                }
-                ++block_count;
-                ++child_count;
+                continue;
             }
+            // Any-hit rays visit first what most likely stops them for its cost.
+            const float area = Builder::half_area(tree[n].low, tree[n].high), surface = costs.data[8ll * n + 7];
+            const float stopped = area > 0.0f ? surface / (area + surface) : 1.0f;
+            const float r = stopped / (costs.data[8ll * n] / (area > 0.0f ? area : 1.0f));
+            int at = child_count++;
+            while (at > 0 && rank[at - 1] < r) { rank[at] = rank[at - 1], roots_found[at] = roots_found[at - 1]; --at; }
+            rank[at] = r, roots_found[at] = n;
         }
-        if (!dry) {
-            ((unsigned char*)wide_node)[72] = (unsigned char)child_count;
-            while (child_count < 8) wide_node[24 + child_count++] = ~0;
+        unsigned* wide_node = wide.data + 32ll * item.wide;
+        for (int c = 0; c < child_count; ++c) {
+            const int n = roots_found[c];
+            if (choices.data[8ll * n]) {
+                if (!dry) wide_node[24 + c] = wide_count;
+                stack[waiting++] = {n, wide_count++};
+                continue;
+            }
+            if (!dry) {
+                wide_node[24 + c] = ~block_count;
+                int* faces = (int*)blocks.data + 40ll * block_count + 36;
+                int lanes = 0;
+                const int left = Builder::word(tree[n].high), last = left ? n + 2 * Builder::word(tree[n].low) - 2 : n;
+                for (int m = n; m <= last; ++m)
+                    if (!Builder::word(tree[m].high)) faces[lanes++] = Builder::word(tree[m].low);
+                while (lanes < 4) faces[lanes++] = -1;
+            }
+            ++block_count;
         }
+        if (!dry) while (child_count < 8) wide_node[24 + child_count++] = ~0;
     }
     counts.data[2] = wide_count;
     counts.data[3] = block_count;
@@ -289,7 +302,8 @@ FILL_NODES = """
     for (int n = count - 1; n >= 0; --n) {
         unsigned* node = nodes.data + 32ll * n;
         unsigned char* rows = (unsigned char*)node;
-        const int child_count = rows[72];
+        int child_count = 0;
+        while (child_count < 8 && (int)node[24 + child_count] != -1) ++child_count;
         float* box = boxes.data + 8ll * n;
         float child_boxes[8][6];
         for (int k = 0; k < 6; ++k) box[k] = k < 3 ? 3.4e38f : -3.4e38f;
@@ -317,18 +331,21 @@ FILL_NODES = """
         double widest = 1e-30;
         for (int k = 0; k < 3; ++k) widest = (double)box[3 + k] - box[k] > widest ? (double)box[3 + k] - box[k] : widest;
         const double pad = 1e-6 * widest;
-        float* frame = (float*)(rows + 48);
+        float* frame = (float*)(rows + 72);
         for (int k = 0; k < 3; ++k) {
             const double size = box[k] < 0.0f ? -(double)box[k] : (double)box[k];
             frame[k] = (float)(box[k] - pad - 2.4e-7 * size);
-            frame[3 + k] = (float)((box[3 + k] + pad - frame[k]) / 254.9);
+            frame[3 + k] = (float)((box[3 + k] + pad - frame[k]) * (32768.0 / 254.0));
+            frame[k] -= frame[3 + k];
+            const double origin = (double)frame[k] + frame[3 + k], step = frame[3 + k] / 32768.0;
             for (int c = 0; c < 8; ++c) {
-                rows[8 * k + c] = 255, rows[24 + 8 * k + c] = 0;
+                unsigned char* row = rows + 24 * k + c;
+                row[0] = row[16] = 255, row[8] = 0;
                 if (c >= child_count || child_boxes[c][k] > child_boxes[c][3 + k]) continue;
-                const double lower = (child_boxes[c][k] - pad - frame[k]) / frame[3 + k];
-                const double upper = (child_boxes[c][3 + k] + pad - frame[k]) / frame[3 + k];
-                rows[8 * k + c] = (unsigned char)(lower < 0.0 ? 0 : (int)lower);
-                rows[24 + 8 * k + c] = (unsigned char)(upper > 254.0 ? 255 : (int)upper + 1);
+                const double lower = (child_boxes[c][k] - pad - origin) / step - 0.02;
+                const double upper = (child_boxes[c][3 + k] + pad - origin) / step + 0.02;
+                row[0] = row[16] = (unsigned char)(lower < 0.0 ? 0 : (int)lower);
+                row[8] = (unsigned char)(upper > 254.0 ? 255 : (int)upper + 1);
             }
         }
     }
@@ -339,6 +356,7 @@ FILL_NODES = """
 def split_top_native(
     refs: wp.array(dtype=wp.float32),
     nodes: wp.array(dtype=wp.float32),
+    costs: wp.array(dtype=wp.float32),
     tasks: wp.array(dtype=wp.int32),
     top: wp.array(dtype=wp.int32),
     counts: wp.array(dtype=wp.int32),
@@ -410,13 +428,15 @@ def bound_triangles(
         refs[8 * face + k] = low[k]
         refs[8 * face + 4 + k] = high[k]
     refs[8 * face + 3] = wp.cast(face, wp.float32)
-    refs[8 * face + 7] = 0.0
+    refs[8 * face + 7] = 0.5 * wp.length(wp.cross(p1 - p0, p2 - p0))
 
 
 # One thread: splits until no range has more than `largest` triangles, and lists the ranges as tasks.
 @wp.kernel
 def split_top(first: wp.int32, build: BuildData, largest: wp.int32):
-    split_top_native(build.refs, build.nodes, build.tasks, build.top, build.counts, build.refs.shape[0] // 8, largest)
+    split_top_native(
+        build.refs, build.nodes, build.costs, build.tasks, build.top, build.counts, build.refs.shape[0] // 8, largest
+    )
 
 
 # Thread: one task of split_top.
