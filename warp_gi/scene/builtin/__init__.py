@@ -1,4 +1,4 @@
-"""Scenes made by code: no files, the same on every machine.
+"""Scenes made by code: no files, fixed seeds, the same every time.
 
 ``builtin_scene(name)`` builds one, ``builtin_camera_path(name)`` is the camera path that shows it.
 """
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from warp_gi.scene.scene import Scene
 
 BUILTIN_SCENES = {
-    "atrium": "two storeys of arcades around a sunlit court, about 160K triangles",
+    "atrium": "two storeys of arcades around a sunlit court, about 170K triangles",
     "cornell_box": "the classic test of colour bleeding, in a box of 2 m",
     "sphere_row": "metal spheres of rising roughness on a plane",
     "street": "houses with balconies and trees with many leaves, about 130K triangles",

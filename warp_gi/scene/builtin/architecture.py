@@ -23,8 +23,8 @@ def base(radius: float, segments: int, fine: bool = True) -> Shape:
         profile = [(0, 0), (1.38 * r, 0), (1.38 * r, 0.3 * r), (1.2 * r, 0.58 * r), (1.08 * r, 0.64 * r)]
         return lathe([*profile, (1.12 * r, 0.78 * r), (r, 0.9 * r), (0, 0.9 * r)], segments)
     plinth = box((-1.38 * r, 0, -1.38 * r), (1.38 * r, 0.28 * r, 1.38 * r), 0.03 * r)
-    profile = [(0, 0.28 * r), *half_round(0.15 * r, 1.2 * r, 0.28 * r, 4)]
-    profile += [(1.16 * r, 0.60 * r), (1.08 * r, 0.66 * r), (1.12 * r, 0.70 * r)]
+    profile = [(0, 0.28 * r), *half_round(0.15 * r, 1.2 * r, 0.28 * r, 3)]
+    profile += [(1.08 * r, 0.65 * r)]
     profile += [*half_round(0.08 * r, 1.06 * r, 0.70 * r, 2), (1.0 * r, 0.90 * r), (0, 0.90 * r)]
     return merge([plinth, lathe(profile, segments)])
 
@@ -57,15 +57,16 @@ def capital(radius: float, width: float, height: float, segments: int, leaves: i
         one = leaf(*size).moved(y=y * height, z=r * (1.02 - 0.02 * row))
         turns = (np.arange(leaves) + 0.5 * row) * 360 / leaves
         parts.append(one.repeated(np.stack([placement(turn=t) for t in turns])))
-    reach = 0.5 * width - 0.09 * height
-    scroll = icosphere(0.085 * height, 1 if fine else 0).scaled(1, 1.15, 1)
-    parts.append(scroll.at([(x * reach, height - abacus - 0.06 * height, z * reach) for x in (-1, 1) for z in (-1, 1)]))
+    if fine:
+        reach, y = 0.5 * width - 0.09 * height, height - abacus - 0.06 * height
+        scroll = icosphere(0.085 * height, 1).scaled(1, 1.15, 1)
+        parts.append(scroll.at([(x * reach, y, z * reach) for x in (-1, 1) for z in (-1, 1)]))
     top = box((-width / 2, height - abacus, -width / 2), (width / 2, height, width / 2), 0.2 * abacus)
     parts.append(top)
     return merge(parts)
 
 
-def baluster(height: float, radius: float, segments: int = 8) -> Shape:
+def baluster(height: float, radius: float, segments: int = 7) -> Shape:
     """Return a turned baluster, closed."""
     outline = [(0.95, 0.0), (0.55, 0.10), (0.66, 0.20), (1.0, 0.34), (0.82, 0.50), (0.42, 0.72), (0.44, 0.84)]
     outline += [(0.95, 0.93), (0.95, 1.0)]
@@ -74,7 +75,7 @@ def baluster(height: float, radius: float, segments: int = 8) -> Shape:
 
 def coffer(width: float, depth: float, rise: float) -> Shape:
     """Return one coffer of a ceiling seen from below, centred, its rim at y = 0, the panel ``rise`` above; open."""
-    steps = [(1.0, 0.0), (0.80, 0.0), (0.76, 0.5), (0.62, 0.5), (0.56, 1.0)]
+    steps = [(1.0, 0.0), (0.80, 0.0), (0.74, 0.6), (0.56, 1.0)]
     corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1], [1, 1]]) * [width / 2, depth / 2]
     rings = [np.column_stack([c[:, 0], np.full(5, h * rise), c[:, 1]]) for s, h in steps for c in [corners * s]]
     sides = loft(np.stack(rings), crease=20.0)
@@ -113,7 +114,7 @@ def fountain(radius: float) -> dict[str, Shape]:
 def lantern(drop: float) -> dict[str, Shape]:
     """Return a lantern that hangs ``drop`` below the origin: "metal" and "glow" (a closed ball)."""
     y = -drop
-    chain = tube(np.array([[0, 0, 0], [0, y + 0.34, 0]]), 0.008, 5)
+    chain = tube(np.array([[0, 0, 0], [0, y + 0.34, 0]]), 0.008, 4)
     roof = lathe([(0, 0.22), (0.15, 0.22), (0.15, 0.235), (0.06, 0.31), (0.03, 0.35), (0, 0.36)], 8).moved(y=y)
     foot = lathe([(0, -0.06), (0.05, -0.05), (0.11, -0.01), (0.11, 0.0), (0, 0.0)], 8).moved(y=y)
     bar = box((-0.006, 0, -0.006), (0.006, 0.22, 0.006))

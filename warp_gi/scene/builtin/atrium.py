@@ -140,10 +140,10 @@ def arcades() -> dict[str, Shape]:
     """Return both storeys' walls: "ashlar" below, "plaster" above, "stone" dressings."""
     lower, upper = arcade_bays(BAY, 0.0), arcade_bays(BAY / 2, 0.0)
     ashlar = [arch(BAY, CEILING - SPRING, 0.93, DEPTH, 20).repeated(raised(lower, SPRING))]
-    plaster = [arch(BAY / 2, UPPER_CEILING - UPPER_SPRING, 0.45, 0.36, 14).repeated(raised(upper, UPPER_SPRING))]
+    plaster = [arch(BAY / 2, UPPER_CEILING - UPPER_SPRING, 0.45, 0.36, 12).repeated(raised(upper, UPPER_SPRING))]
     stone = [
         archivolt(0.93, 0.19, DEPTH, 20).repeated(raised(lower, SPRING)),
-        archivolt(0.45, 0.10, 0.36, 14, fine=False).repeated(raised(upper, UPPER_SPRING)),
+        archivolt(0.45, 0.10, 0.36, 12, fine=False).repeated(raised(upper, UPPER_SPRING)),
     ]
     keystone = box((-0.09, 0.88, -DEPTH / 2 - 0.11), (0.09, 1.24, DEPTH / 2 + 0.11), 0.02)
     stone.append(keystone.repeated(raised(lower, SPRING)))
@@ -227,7 +227,7 @@ def columns() -> dict[str, Shape]:
             [(-0.42, UPPER), (-0.06, UPPER), (-0.06, UPPER + 0.1), (-0.42, UPPER + 0.1)], HALF_X - 0.25, HALF_Z - 0.25
         )
     )
-    post = box((-0.14, 0, -0.14), (0.14, RAIL - 0.1, 0.14), 0.012)
+    post = box((-0.14, 0, -0.14), (0.14, RAIL - 0.1, 0.14), 0.0)
     stone.append(post.repeated(raised(upper, UPPER)))
     turned = parts.baluster(RAIL - 0.22, 0.065)
     bays = arcade_bays(BAY / 2, 0.0)
@@ -249,14 +249,14 @@ def outer_walls() -> dict[str, Shape]:
     upper = [(-0.3, UPPER - 0.1), (0.0, UPPER - 0.1), (0.0, UPPER_CEILING + 0.3), (-0.3, UPPER_CEILING + 0.3)]
     plaster.append(ribbon_ring(upper, WALL_X, WALL_Z))
     stone, wood = [], []
-    panel = arch(BAY, CEILING + 0.3 - 2.5, 0.62, 0.26, 16)
+    panel = arch(BAY, CEILING + 0.3 - 2.5, 0.62, 0.26, 12)
     jamb = box((-0.58, 0.0, -0.13), (0.58, 2.5, 0.13))
     door = box((-0.62, 0.0, 0.06), (0.62, 3.14, 0.125), 0.01)
-    frame = archivolt(0.62, 0.13, 0.26, 16, fine=False)
+    frame = archivolt(0.62, 0.13, 0.26, 12, fine=False)
     post = box((-0.065, 0.0, -0.17), (0.065, 2.5, 0.17))
-    base_board = box((-0.51, 0.0, -0.16), (0.51, 0.32, 0.16), 0.015)
+    base_board = box((-0.51, 0.0, -0.16), (0.51, 0.32, 0.16))
     doors = []
-    for half, other, turn, count in ((WALL_X, WALL_Z, 0.0, 7), (WALL_Z, WALL_X, 90.0, 10)):
+    for other, turn, count in ((WALL_Z, 0.0, 7), (WALL_X, 90.0, 10)):
         for side in (0.0, 180.0):
             for k in range(count + 1):
                 along = (k - count / 2) * BAY
@@ -284,13 +284,19 @@ def outer_walls() -> dict[str, Shape]:
 
 def banners() -> dict[str, Shape]:
     """Return cloths hung from the balustrade into the court, by colour."""
-    colors = {"crimson": [], "indigo": [], "saffron": []}
-    order = ("crimson", "saffron", "indigo")
-    places = [(-1, -7.2), (-1, -2.4), (-1, 2.4), (1, -4.8), (1, 0.0), (1, 4.8)]
-    for k, (side, z) in enumerate(places):
+    places = [
+        ("indigo", -1, -7.2),
+        ("crimson", -1, -2.4),
+        ("saffron", -1, 2.4),
+        ("saffron", 1, -4.8),
+        ("indigo", 1, 0.0),
+        ("crimson", 1, 4.8),
+    ]
+    colors: dict[str, list[Shape]] = {"crimson": [], "indigo": [], "saffron": []}
+    for k, (color, side, z) in enumerate(places):
         piece = drape(1.55, 2.7 + 0.25 * (k % 2), seed=k)
         place = placement((side * (HALF_X - 0.29), UPPER + RAIL + 0.015, z)) @ placement(turn=-90.0 * side)
-        colors[order[k % 3]].append(piece.transformed(place))
+        colors[color].append(piece.transformed(place))
     return {name: merge(pieces).textured(0.8) for name, pieces in colors.items()}
 
 
@@ -316,10 +322,10 @@ def greenery() -> dict[str, Shape]:
     tree = {
         **tub,
         "bark": trunk.moved(y=0.5),
-        "leaves": parts.foliage(tips + [0, 0.55, 0], 0.42, 950, 0.14, seed=4),
+        "leaves": parts.foliage(tips + np.array([0, 0.55, 0]), 0.42, 820, 0.15, seed=4),
     }
     small = parts.pot(0.24, 0.36, 16)
-    bush = {**small, "leaves": parts.foliage(np.array([[0, 0.52, 0], [0.08, 0.68, 0.05]]), 0.25, 200, 0.125, seed=6)}
+    bush = {**small, "leaves": parts.foliage(np.array([[0, 0.52, 0], [0.08, 0.68, 0.05]]), 0.25, 170, 0.13, seed=6)}
     trees = [
         placement((x, 0, z), turn=57.0 * k)
         for k, (x, z) in enumerate(((-2.9, -2.9), (2.9, -2.9), (-2.9, 2.9), (2.9, 2.9)))

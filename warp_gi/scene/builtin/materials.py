@@ -125,3 +125,32 @@ def water() -> Material:
 def bronze() -> Material:
     """Return dull bronze."""
     return plain("bronze", (0.43, 0.27, 0.12), roughness=0.38, metallic=1.0)
+
+
+def concrete(name: str = "concrete", color: Color = (0.42, 0.41, 0.39)) -> Material:
+    """Return stained concrete, over 4 m."""
+    stain = tx.smoothstep(-1.5, 2.5, tx.noise(111, 1.6, 1))
+    shade = 1 + 0.05 * tx.noise(112, 0.6, 8)
+    base = tx.blend(color, np.multiply(color, 0.6), stain) * shade[..., None]
+    return textured(name, base, (0.9 - 0.35 * stain).astype(np.float32), 0.0008 * tx.noise(113, 1.0, 6, 120), 4.0)
+
+
+def crate_wood() -> Material:
+    """Return pale rough planks that run along u, 4 over 0.8 m."""
+    color, height = tx.wood((0.25, 0.15, 0.075), (0.52, 0.36, 0.20), seed=121)
+    return textured("crate wood", color, 0.8, 0.004 * height, 0.8)
+
+
+def asphalt() -> Material:
+    """Return asphalt, over 3 m."""
+    stain = tx.smoothstep(-2.0, 2.0, tx.noise(131, 1.5, 1))
+    base = tx.blend((0.105, 0.10, 0.097), (0.06, 0.058, 0.057), stain) * (1 + 0.18 * tx.noise(132, 0.2, 30))[..., None]
+    return textured("asphalt", base, 0.85, 0.0016 * tx.noise(132, 0.2, 30), 3.0)
+
+
+def paving() -> Material:
+    """Return grey paving slabs, 5 x 5 over 2 m."""
+    color, height, _ = tx.tiles(
+        [(0.40, 0.38, 0.35), (0.36, 0.345, 0.32)], (0.17, 0.16, 0.145), (5, 5), seed=141, shift=0.5, joint_width=1.5
+    )
+    return textured("paving", color, 0.85, 0.003 * height, 2.0)

@@ -122,8 +122,9 @@ def placement(
 
 
 def merge(shapes: Iterable[Shape]) -> Shape:
-    """Return all shapes as one."""
-    shapes = list(shapes)
+    """Return all shapes as one; of none, an empty one."""
+    empty = Shape(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 2)), np.zeros((0, 3)))
+    shapes = list(shapes) or [empty]
     starts = np.cumsum([0, *(len(s.points) for s in shapes[:-1])])
     indices = np.concatenate([s.indices + start for s, start in zip(shapes, starts, strict=True)])
     points, uvs, normals = (np.concatenate([getattr(s, k) for s in shapes]) for k in ("points", "uvs", "normals"))

@@ -1,4 +1,4 @@
-"""Procedural textures: small, 8-bit, without seams, the same on every machine."""
+"""Procedural textures: small, 8-bit, without seams, from fixed seeds."""
 
 from __future__ import annotations
 
