@@ -40,7 +40,7 @@ def triangle_light_pdf(
     projected = 0.5 * wp.abs(wp.dot(normal, direction))
     if projected <= 0.0:
         return 0.0
-    return scene.emitters.pdf[emitter] * distance * distance / projected
+    return scene.emitters.alias[emitter].pdf * distance * distance / projected
 
 
 # Falloff of KHR_lights_punctual: inverse square, ended smoothly at `range`.
@@ -60,8 +60,8 @@ def sample_emitter(scene: SceneData, position: wp.vec3, u_select: wp.float32, u:
     e = scene.emitters
     if e.count == 0:
         return r
-    index = alias_choice_small(e.alias_probability, e.alias_index, e.count, u_select).item
-    light = e.emitters[index]
+    choice = alias_choice_small(e.alias, e.count, u_select)
+    light = e.emitters[choice.item]
     if light.kind == EMITTER_TRIANGLE:
         b = triangle_barycentrics(u)
         ids = scene.geometry.indices[light.triangle]
@@ -76,11 +76,11 @@ def sample_emitter(scene: SceneData, position: wp.vec3, u_select: wp.float32, u:
         material = scene.materials[scene.geometry.materials[light.triangle]]
         if material.double_sided == 0 and wp.dot(wp.cross(p1 - p0, p2 - p0), r.direction) >= 0.0:
             return r
-        r.pdf = triangle_light_pdf(scene, index, light.triangle, r.direction, r.distance)
+        r.pdf = triangle_light_pdf(scene, choice.item, light.triangle, r.direction, r.distance)
         r.radiance = emitted_radiance(scene, light.triangle, b[0], b[1])
         return r
     r.delta = 1
-    r.pdf = e.pdf[index]
+    r.pdf = choice.pdf
     if light.kind == EMITTER_DIRECTIONAL:
         r.direction = -light.direction
         r.distance = INFINITE_DISTANCE

@@ -97,7 +97,7 @@ def environment_pdf(env: Environment, direction: wp.vec3) -> wp.float32:
         uv = lat_long_encode(env.environment_from_world * direction)
         column = wp.clamp(wp.int32(uv[0] * wp.float32(env.width)), 0, env.width - 1)
         row = wp.clamp(wp.int32(uv[1] * wp.float32(env.height - 1) + 0.5), 0, env.height - 1)
-        return env.pdf[row * env.width + column] / cell_solid_angle(row_bounds(row, env.height), env.width)
+        return env.alias[row * env.width + column].pdf / cell_solid_angle(row_bounds(row, env.height), env.width)
     if env.kind == ENVIRONMENT_CONSTANT:
         return UNIFORM_SPHERE_PDF
     return 0.0
@@ -109,7 +109,7 @@ def environment_pdf(env: Environment, direction: wp.vec3) -> wp.float32:
 def environment_sample(env: Environment, u: wp.vec3) -> EnvironmentSample:
     result = EnvironmentSample()
     if env.kind == ENVIRONMENT_MAP:
-        choice = alias_choice(env.alias_probability, env.alias_index, env.width * env.height, u[0], u[2])
+        choice = alias_choice(env.alias, env.width * env.height, u[0], u[2])
         row = choice.item / env.width
         column = choice.item - row * env.width
         bounds = row_bounds(row, env.height)
@@ -134,7 +134,7 @@ def environment_sample(env: Environment, u: wp.vec3) -> EnvironmentSample:
         local = wp.vec3(sin_theta * wp.sin(phi), cos_theta, -sin_theta * wp.cos(phi))
         result.direction = wp.transpose(env.environment_from_world) * local
         result.radiance = bilinear_radiance(env, uv)
-        result.pdf = env.pdf[choice.item] / cell_solid_angle(bounds, env.width)
+        result.pdf = choice.pdf / cell_solid_angle(bounds, env.width)
     elif env.kind == ENVIRONMENT_CONSTANT:
         z = 1.0 - 2.0 * u[1]
         r = wp.sqrt(wp.max(0.0, 1.0 - z * z))

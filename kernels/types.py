@@ -63,6 +63,16 @@ class Geometry:
     emitters: wp.array(dtype=wp.int32)  # [triangle] index in Emitters, or -1
 
 
+# Bucket of an alias table: itself with `probability`, else item `index`; with the pdfs
+# of both, so that one cache line answers a draw.
+@wp.struct
+class AliasBucket:
+    probability: wp.float32
+    index: wp.int32
+    pdf: wp.float32  # of selecting the bucket's own item, however it is reached
+    index_pdf: wp.float32  # of item `index`
+
+
 # The sky. A map is latitude-longitude: in environment space
 #   u = fract(atan2(x, -z) / 2 pi), v = acos(y) / pi (v = 0 is up, row 0 the top row),
 # which is Mitsuba's `envmap` with an identity to_world. Radiance is the bilinear
@@ -75,9 +85,7 @@ class Environment:
     width: wp.int32
     height: wp.int32
     texels: wp.array(dtype=wp.vec3)  # [height * width]
-    alias_probability: wp.array(dtype=wp.float32)  # [height * width] alias table over texels
-    alias_index: wp.array(dtype=wp.int32)
-    pdf: wp.array(dtype=wp.float32)  # [height * width] probability of the texel (sums to 1)
+    alias: wp.array(dtype=AliasBucket)  # [height * width] table over texels
 
 
 @wp.struct
@@ -96,9 +104,7 @@ class Emitter:
 class Emitters:
     count: wp.int32
     emitters: wp.array(dtype=Emitter)  # [count] emissive triangles first, then punctual lights
-    alias_probability: wp.array(dtype=wp.float32)  # [count] alias table of the current light sampler
-    alias_index: wp.array(dtype=wp.int32)
-    pdf: wp.array(dtype=wp.float32)  # [count] probability of selecting the emitter
+    alias: wp.array(dtype=AliasBucket)  # [count] table of the current light sampler
 
 
 # One way of cutting holes into triangles: a hit where the texture's bilinear

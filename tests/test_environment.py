@@ -7,6 +7,10 @@ import numpy as np
 import pytest
 import warp as wp
 from statistics_tools import chi_squared
+
+from warp_gi import launch
+from warp_gi.alias import AliasTable
+from warp_gi.errors import OptionError, SceneError
 from warp_gi.kernels.alias import alias_choice, alias_choice_small
 from warp_gi.kernels.environment import (
     environment_pdf,
@@ -15,11 +19,8 @@ from warp_gi.kernels.environment import (
     lat_long_decode,
     lat_long_encode,
 )
+from warp_gi.kernels.types import AliasBucket
 from warp_gi.kernels.types import Environment as EnvironmentData
-
-from warp_gi import launch
-from warp_gi.alias import AliasTable
-from warp_gi.errors import OptionError, SceneError
 from warp_gi.scene.environment import Environment, SunSky, as_environment
 
 DEVICES = ["cpu", "cuda"] if wp.is_cuda_available() else ["cpu"]
@@ -65,19 +66,21 @@ def encode_decode(first: wp.int32, directions: wp.array(dtype=wp.vec3), uvs: wp.
 @wp.kernel
 def choose(
     first: wp.int32,
-    probability: wp.array(dtype=wp.float32),
-    index: wp.array(dtype=wp.int32),
+    buckets: wp.array(dtype=AliasBucket),
     numbers: wp.array(dtype=wp.vec2),
     items: wp.array2d(dtype=wp.int32),
     remainders: wp.array2d(dtype=wp.float32),
+    pdfs: wp.array2d(dtype=wp.float32),
 ):
     i = first + wp.tid()
-    a = alias_choice(probability, index, probability.shape[0], numbers[i][0], numbers[i][1])
-    b = alias_choice_small(probability, index, probability.shape[0], numbers[i][0])
+    a = alias_choice(buckets, buckets.shape[0], numbers[i][0], numbers[i][1])
+    b = alias_choice_small(buckets, buckets.shape[0], numbers[i][0])
     items[i, 0] = a.item
     items[i, 1] = b.item
     remainders[i, 0] = a.remainder
     remainders[i, 1] = b.remainder
+    pdfs[i, 0] = a.pdf
+    pdfs[i, 1] = b.pdf
 
 
 def evaluate(env: Environment, directions: np.ndarray, device: str = "cpu") -> tuple[np.ndarray, np.ndarray]:
@@ -153,13 +156,16 @@ def test_alias_table_is_sampled_as_its_pdf_says(count):
     numbers = rng.random((200_000, 2), dtype=np.float32)
     items = wp.zeros((len(numbers), 2), dtype=wp.int32, device="cpu")
     remainders = wp.zeros((len(numbers), 2), dtype=wp.float32, device="cpu")
-    arrays = [wp.array(a, device="cpu") for a in (table.probability, table.index)]
-    inputs = [*arrays, wp.array(numbers, dtype=wp.vec2, device="cpu"), items, remainders]
+    pdfs = wp.zeros((len(numbers), 2), dtype=wp.float32, device="cpu")
+    cpu = wp.get_device("cpu")
+    inputs = [table.on(cpu), wp.array(numbers, dtype=wp.vec2, device="cpu"), items, remainders, pdfs]
     launch.launch(choose, len(numbers), inputs, wp.get_device("cpu"))
     for chosen, rest in zip(items.numpy().T, remainders.numpy().T, strict=True):
         counts = np.bincount(chosen, minlength=count)
         assert (counts[weights == 0] == 0).all()
         assert chi_squared(counts, len(numbers) * table.pdf.astype(np.float64)) > 1e-4
+        assert np.array_equal(pdfs.numpy()[:, 0], table.pdf[items.numpy()[:, 0]])
+        assert np.array_equal(pdfs.numpy()[:, 1], table.pdf[items.numpy()[:, 1]])
         assert rest.min() >= 0 and rest.max() < 1
         assert chi_squared(np.histogram(rest, 50, (0, 1))[0], np.full(50, len(numbers) / 50)) > 1e-4
 

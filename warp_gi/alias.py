@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import warp as wp
+
+from warp_gi.kernels import types
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,6 +20,13 @@ class AliasTable:
     """int32 [n]"""
     pdf: np.ndarray
     """float32 [n] probability of each item as the table really samples it; sums to 1."""
+
+    def on(self, device: wp.Device) -> wp.array:
+        """Return the buckets that kernels read, [n] of types.AliasBucket, on a device."""
+        buckets = np.empty(len(self.pdf), types.AliasBucket.numpy_dtype())
+        buckets["probability"], buckets["index"] = self.probability, self.index
+        buckets["pdf"], buckets["index_pdf"] = self.pdf, self.pdf[self.index]
+        return wp.array(buckets, dtype=types.AliasBucket, device=device)
 
     @staticmethod
     def build(weights: np.ndarray) -> AliasTable:

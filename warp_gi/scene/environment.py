@@ -55,16 +55,11 @@ class _Map:
         return self.pixels.sum(1, dtype=np.float64).T @ node_solid_angles(height, width) / (4 * math.pi)
 
     def on(self, device: wp.Device) -> tuple[wp.array, ...]:
-        """Return texels, alias probability, alias index and pdf on the device."""
+        """Return texels and alias table on the device."""
         if device.alias not in self.arrays:
             table = AliasTable.build(_cell_weights(self.pixels))
             texels = wp.array(self.pixels.reshape(-1, 3), dtype=wp.vec3, device=device)
-            rest = (
-                wp.array(table.probability, dtype=wp.float32, device=device),
-                wp.array(table.index, dtype=wp.int32, device=device),
-                wp.array(table.pdf, dtype=wp.float32, device=device),
-            )
-            self.arrays[device.alias] = (texels, *rest)
+            self.arrays[device.alias] = (texels, table.on(device))
         return self.arrays[device.alias]
 
 
@@ -185,7 +180,7 @@ class Environment:
             result.radiance = wp.vec3(self.scale, self.scale, self.scale)
             result.height, result.width = self._map.pixels.shape[:2]
             arrays = self._map.on(target)
-            result.texels, result.alias_probability, result.alias_index, result.pdf = arrays
+            result.texels, result.alias = arrays
         return result
 
 

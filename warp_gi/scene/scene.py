@@ -283,9 +283,7 @@ class _DeviceScene:
         data.srgb_to_linear = self._array(textures.SRGB_TO_LINEAR.copy(), wp.float32)
         data.emitters.count = len(self.emitters)
         data.emitters.emitters = self._array(self.emitters, types.Emitter)
-        data.emitters.alias_probability = wp.empty(0, dtype=wp.float32, device=device)
-        data.emitters.alias_index = wp.empty(0, dtype=wp.int32, device=device)
-        data.emitters.pdf = wp.empty(0, dtype=wp.float32, device=device)
+        data.emitters.alias = wp.empty(0, dtype=types.AliasBucket, device=device)
         low, high = scene.bounds
         data.center = wp.vec3(*(float(x) for x in (low.astype(np.float64) + high) / 2.0))
         data.radius = scene.radius

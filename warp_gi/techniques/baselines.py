@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-import warp as wp
 
 from warp_gi.alias import AliasTable
 from warp_gi.errors import OptionError
@@ -43,17 +42,8 @@ class _SampledLights(Estimator):
         if frame.scene.emitter_count == 0:
             return None
         if state is None:
-            table = AliasTable.build(self.weights(frame.scene))
-            state = [
-                wp.array(values, dtype=dtype, device=frame.device)
-                for values, dtype in (
-                    (table.probability, wp.float32),
-                    (table.index, wp.int32),
-                    (table.pdf, wp.float32),
-                )
-            ]
-        emitters = frame.data.emitters
-        emitters.alias_probability, emitters.alias_index, emitters.pdf = state
+            state = AliasTable.build(self.weights(frame.scene)).on(frame.device)
+        frame.data.emitters.alias = state
         return state
 
     def trace(self, frame: Any, state: Any) -> None:
