@@ -333,10 +333,10 @@ FILL_NODES = """
         const double pad = 1e-6 * widest;
         float* frame = (float*)(rows + 72);
         for (int k = 0; k < 3; ++k) {
-            const double size = box[k] < 0.0f ? -(double)box[k] : (double)box[k];
-            frame[k] = (float)(box[k] - pad - 2.4e-7 * size);
-            frame[3 + k] = (float)((box[3 + k] + pad - frame[k]) * (32768.0 / 254.0));
-            frame[k] -= frame[3 + k];
+            const double low = box[k], high = box[3 + k], size = -low > high ? -low : high;
+            const double margin = 2e-5 * (high - low) + 2.0 * pad + 5e-7 * size;  // keeps rounded base and span outside
+            frame[3 + k] = (float)((high - low + 2.0 * margin) * (32768.0 / 253.0));
+            frame[k] = (float)(low - margin - frame[3 + k]);
             const double origin = (double)frame[k] + frame[3 + k], step = frame[3 + k] / 32768.0;
             for (int c = 0; c < 8; ++c) {
                 unsigned char* row = rows + 24 * k + c;
@@ -451,7 +451,14 @@ def widen(first: wp.int32, build: BuildData, nodes: wp.array(dtype=wp.uint32), b
     widen_native(build.nodes, build.top, build.counts, build.costs, build.choices, nodes, blocks)
 
 
-# Thread: one block. Zero-area triangles become all zeros, which no ray hits.
+@wp.func
+def has_area(p0: wp.vec3, p1: wp.vec3, p2: wp.vec3) -> wp.bool:
+    a = wp.vec3d(p1) - wp.vec3d(p0)
+    b = wp.vec3d(p2) - wp.vec3d(p0)
+    return wp.length_sq(wp.cross(a, b)) > wp.float64(0.0)
+
+
+# Thread: one block. Zero-area triangles shrink to a point, which no ray hits.
 @wp.kernel
 def fill_blocks(
     first: wp.int32,
@@ -472,6 +479,9 @@ def fill_blocks(
             p0 = points[corner[0]]
             p1 = points[corner[1]]
             p2 = points[corner[2]]
+            if not has_area(p0, p1, p2):
+                p1 = p0
+                p2 = p0
             if face_masks.shape[0] > 0:
                 if face_masks[face] >= 0:
                     face = face | FACE_MASKED

@@ -238,6 +238,8 @@ def _checked_points(points: object) -> np.ndarray:
     positions = _as_numpy(points)
     if positions.ndim != 2 or positions.shape[1] != 3:
         raise SceneError(f"points must have shape [vertex, 3], got {list(positions.shape)}")
+    if len(positions) == 0:
+        raise SceneError("expected at least one vertex, got none")
     positions = np.ascontiguousarray(positions, dtype=np.float32)
     if not np.isfinite(positions).all():
         bad = int(np.flatnonzero(~np.isfinite(positions).all(axis=1))[0])
