@@ -83,6 +83,21 @@ def coffer(width: float, depth: float, rise: float) -> Shape:
     return merge([sides, quad((-w / 2, rise, -d / 2), (w, 0, 0), (0, 0, d))]).box_mapped()
 
 
+def archivolt(radius: float, width: float, depth: float, segments: int, fine: bool = True) -> Shape:
+    """Return the moulded band around an arch, standing out of both faces of a wall of ``depth``; open at its feet."""
+    angle = np.linspace(0, math.pi, segments + 1)
+    z = depth / 2 + 0.04
+    half = (
+        [(-0.02, z), (width * 0.45, z), (width * 0.55, z + 0.03), (width, z + 0.03)]
+        if fine
+        else [(-0.02, z), (width, z)]
+    )
+    profile = np.array([*half, *((x, -y) for x, y in half[::-1]), half[0]])
+    r, around = radius + profile[:, 0], angle[:, None]
+    grid = np.broadcast_arrays(r * np.cos(around), r * np.sin(around), profile[:, 1])
+    return loft(np.stack(grid, axis=-1), crease=35.0)
+
+
 def fountain(radius: float) -> dict[str, Shape]:
     """Return a round fountain of two bowls: "stone" and "water"."""
     wall = [(radius * 1.12, 0), (radius * 1.12, 0.10), (radius * 1.02, 0.14), (radius * 0.98, 0.40)]

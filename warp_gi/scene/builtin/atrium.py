@@ -25,7 +25,7 @@ from warp_gi.scene.builtin.shapes import (
     ribbon_ring,
 )
 from warp_gi.scene.environment import SunSky, as_environment
-from warp_gi.scene.model import Material, Mesh, Node
+from warp_gi.scene.model import Material, Node
 from warp_gi.scene.scene import Scene
 
 BAY = 2.4
@@ -70,21 +70,6 @@ def column_places(step: float) -> list[np.ndarray]:
 def raised(places: list[np.ndarray], y: float) -> np.ndarray:
     """Return the placements moved up."""
     return np.stack([placement((0, y, 0)) @ p for p in places])
-
-
-def archivolt(radius: float, width: float, depth: float, segments: int, fine: bool = True) -> Shape:
-    """Return the moulded band around an arch, standing out of both faces of a wall of ``depth``; open at its feet."""
-    angle = np.linspace(0, math.pi, segments + 1)
-    z = depth / 2 + 0.04
-    half = (
-        [(-0.02, z), (width * 0.45, z), (width * 0.55, z + 0.03), (width, z + 0.03)]
-        if fine
-        else [(-0.02, z), (width, z)]
-    )
-    profile = np.array([*half, *((x, -y) for x, y in half[::-1]), half[0]])
-    r, around = radius + profile[:, 0], angle[:, None]
-    grid = np.broadcast_arrays(r * np.cos(around), r * np.sin(around), profile[:, 1])
-    return loft(np.stack(grid, axis=-1), crease=35.0)
 
 
 def floors() -> dict[str, Shape]:
@@ -142,8 +127,8 @@ def arcades() -> dict[str, Shape]:
     ashlar = [arch(BAY, CEILING - SPRING, 0.93, DEPTH, 20).repeated(raised(lower, SPRING))]
     plaster = [arch(BAY / 2, UPPER_CEILING - UPPER_SPRING, 0.45, 0.36, 12).repeated(raised(upper, UPPER_SPRING))]
     stone = [
-        archivolt(0.93, 0.19, DEPTH, 20).repeated(raised(lower, SPRING)),
-        archivolt(0.45, 0.10, 0.36, 12, fine=False).repeated(raised(upper, UPPER_SPRING)),
+        parts.archivolt(0.93, 0.19, DEPTH, 20).repeated(raised(lower, SPRING)),
+        parts.archivolt(0.45, 0.10, 0.36, 12, fine=False).repeated(raised(upper, UPPER_SPRING)),
     ]
     keystone = box((-0.09, 0.88, -DEPTH / 2 - 0.11), (0.09, 1.24, DEPTH / 2 + 0.11), 0.02)
     stone.append(keystone.repeated(raised(lower, SPRING)))
@@ -252,7 +237,7 @@ def outer_walls() -> dict[str, Shape]:
     panel = arch(BAY, CEILING + 0.3 - 2.5, 0.62, 0.26, 12)
     jamb = box((-0.58, 0.0, -0.13), (0.58, 2.5, 0.13))
     door = box((-0.62, 0.0, 0.06), (0.62, 3.14, 0.125), 0.01)
-    frame = archivolt(0.62, 0.13, 0.26, 12, fine=False)
+    frame = parts.archivolt(0.62, 0.13, 0.26, 12, fine=False)
     post = box((-0.065, 0.0, -0.17), (0.065, 2.5, 0.17))
     base_board = box((-0.51, 0.0, -0.16), (0.51, 0.32, 0.16))
     doors = []
@@ -389,7 +374,7 @@ def scene() -> Scene:
         ),
         ("lanterns", lanterns(), {"metal": bronze, "glow": materials.lamp("lantern glow", (90.0, 48.0, 17.0))}),
     ]
-    nodes = [Node(name, [_mesh(s, m[k], f"{name} {k}") for k, s in shapes.items()]) for name, shapes, m in groups]
+    nodes = [Node(name, [s.mesh(m[k], f"{name} {k}") for k, s in shapes.items()]) for name, shapes, m in groups]
     eye, target = VIEW
     cameras = {
         "main": Camera.look_at(eye, target, hfov=68.0),
@@ -397,10 +382,6 @@ def scene() -> Scene:
         "upper": Camera.look_at((6.9, 7.0, 7.4), (-2.5, 3.2, -4.5), hfov=68.0),
     }
     return Scene(nodes, environment=as_environment(SKY), cameras=cameras, name="atrium")
-
-
-def _mesh(shape: Shape, material: Material, name: str) -> Mesh:
-    return shape.mesh(material, name)
 
 
 def camera_path() -> CameraPath:
