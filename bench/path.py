@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,8 @@ from warp_gi.metrics import RELATIVE_EPSILON
 
 Row = dict[str, Any]
 REPETITIONS = 6
+CAMERA_SAMPLES = 8
+"""Camera rays a pixel that our 64 samples share; Mitsuba's have one each."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,7 @@ def run(quick: bool = False, device: str = "cpu") -> list[Row]:
 def pipeline(max_depth: int, spp: int) -> gi.Pipeline:
     """Return the path tracer with paths of at most ``max_depth`` edges; 2 is direct light."""
     indirect = gi.BsdfPaths(max_depth=max_depth) if max_depth > 2 else None
-    return gi.Pipeline.preset("path", spp=spp, indirect=indirect)
+    return gi.Pipeline.preset("path", spp=spp, camera_samples=min(CAMERA_SAMPLES, spp), indirect=indirect)
 
 
 def compare(case: Case, quick: bool, device: str) -> Row:
@@ -112,6 +115,7 @@ def compare(case: Case, quick: bool, device: str) -> Row:
         row["faster (wall)"] = row["mitsuba wall s"] / row["ours wall s"]
         row["faster (cpu)"] = row["mitsuba cpu s"] / row["ours cpu s"]
         row["error ratio"] = row["ours relMSE"] / row["mitsuba relMSE"]
+        row["efficiency ratio"] = row["faster (cpu)"] / row["error ratio"]
         row["means differ"] = float(np.mean(images["ours"]) / np.mean(images["mitsuba"]) - 1)
     return row
 
@@ -171,16 +175,19 @@ def _child(scene: str, size: tuple[int, int], spp: int, device: str, cache: str 
     ]
     done = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
-        return {"skipped": "failed: " + (done.stderr.strip().splitlines() or ["no message"])[-1]}
+        return {"failed": (done.stderr.strip().splitlines() or ["no message"])[-1]}
     result = json.loads(done.stdout.strip().splitlines()[-1])
     finished = result.pop("finished")
     return {"pixels": f"{size[0]}x{size[1]}", "spp": spp, "wall s": finished - started} | result
 
 
 def _child_main(scene: str, width: str, height: str, spp: str, device: str) -> None:
+    started = time.time()
     import warp as wp
 
     wp.config.quiet = True
+    wp.init()
+    imported = time.time()
     views = {
         "crytek_sponza.glb": presets.SPONZA_VIEW,
         "bistro_exterior.glb": gi.Camera.look_at((-40, 45, -60), (-10, 0, -10)),
@@ -189,13 +196,24 @@ def _child_main(scene: str, width: str, height: str, spp: str, device: str) -> N
         loaded = gi.load_scene(presets.SCENES / scene, environment=(1.0, 1.0, 1.0))
     else:
         loaded = gi.builtin_scene(scene)
+    built = time.time()
     camera = views.get(scene) or next(iter(loaded.cameras.values()))
     camera = replace(camera, resolution=(int(width), int(height)))
     frame = next(iter(gi.render(loaded, camera, gi.Pipeline.preset("path", spp=int(spp)), device=device)))
     frame.numpy("beauty")
     finished = time.time()
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-    print(json.dumps({"finished": finished, "compile s": frame.timings.get("compile", 0.0), "peak GB": peak / 1e9}))
+    seconds = {"imports s": imported - started, "scene s": built - imported, "frame s": finished - built}
+    seconds |= {"compile s": frame.timings.get("compile", 0.0), "cpu s": time.process_time()}
+    print(json.dumps({"finished": finished, **seconds, "peak GB": peak_memory() / 1e9}))
+
+
+def peak_memory() -> float:
+    """Return the most bytes of memory this process has had resident."""
+    try:
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+        return 1024.0 * int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1])
+    except (OSError, StopIteration):  # not Linux; a fork's getrusage may count its parent, which VmHWM does not
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0)
 
 
 def main() -> None:

@@ -87,6 +87,7 @@ def compare_images(
     alpha: float = 0.001,
     reference_dof: float = np.inf,
     noise_ratio: float = 0.0,
+    systematic: float = 0.0,
 ) -> str:
     """Raise AssertionError unless ``images`` [seed, height, width, channels] have ``reference`` as expectation.
 
@@ -97,6 +98,7 @@ def compare_images(
     A pixel that light reaches by rare paths has too small a variance whenever it has too
     small a mean, which no t-test allows for. So the variance of ours is taken to be at least
     ``noise_ratio`` times the reference's: samples of the reference over samples of ours.
+    ``systematic`` is the relative standard error of the reference that no sample lessens.
     """
     images = np.asarray(images, dtype=np.float64)
     seeds = len(images)
@@ -107,7 +109,8 @@ def compare_images(
         mean, variance = mean_and_variance(np.stack(sums[:seeds]))
         least = noise_ratio * sums[-1]
         dof = np.where(variance > least, seeds - 1, reference_dof)
-        tests[label] = z_test(mean, np.maximum(variance, least), sums[-2], sums[-1], alpha, dof, reference_dof)
+        known = sums[-1] + (systematic * sums[-2]) ** 2
+        tests[label] = z_test(mean, np.maximum(variance, least), sums[-2], known, alpha, dof, reference_dof)
     mean, variance = mean_and_variance(images)
     sigma = np.sqrt(np.maximum(variance, noise_ratio * reference_variance) + reference_variance)
     line = f"{name}: " + ", ".join(f"{k} p {t.p_min:.1e} (limit {t.p_limit:.1e})" for k, t in tests.items())
