@@ -45,3 +45,15 @@ def alias_choice(buckets: wp.array(dtype=AliasBucket), count: wp.int32, u: wp.fl
 def alias_choice_small(buckets: wp.array(dtype=AliasBucket), count: wp.int32, u: wp.float32) -> AliasChoice:
     scaled = u * wp.float32(count)
     return alias_choice(buckets, count, u, scaled - wp.floor(scaled))
+
+
+# Starts fetching the bucket that alias_choice will read for u.
+@wp.func_native(
+    snippet="""
+#if !defined(__CUDA_ARCH__)
+    const int bucket = (int)(u * (float)count);
+    __builtin_prefetch(&buckets.data[bucket < count ? bucket : count - 1]);
+#endif
+"""
+)
+def alias_prefetch(buckets: wp.array(dtype=AliasBucket), count: wp.int32, u: wp.float32): ...

@@ -12,7 +12,7 @@ Diffuse lobes are sampled by cosine, GGX by visible normals (Dupuy and Benyoub 2
 
 import warp as wp
 
-from warp_gi.kernels.sampling import cosine_direction
+from warp_gi.kernels.sampling import circle, cosine_direction
 
 wp.set_module_options({"enable_backward": False})
 
@@ -121,8 +121,8 @@ def ggx_visible_normal(alpha: wp.float32, wo: wp.vec3, u: wp.vec2) -> wp.vec3:
     w = wp.normalize(wp.vec3(alpha * wo[0], alpha * wo[1], wo[2]))
     z = (1.0 - u[1]) * (1.0 + w[2]) - w[2]
     s = wp.sqrt(wp.clamp(1.0 - z * z, 0.0, 1.0))
-    angle = 2.0 * wp.pi * u[0]
-    h = wp.vec3(s * wp.cos(angle), s * wp.sin(angle), z) + w
+    c = circle(u[0]) * s
+    h = wp.vec3(c[0], c[1], z) + w
     return wp.normalize(wp.vec3(alpha * h[0], alpha * h[1], wp.max(h[2], 1.0e-6)))
 
 

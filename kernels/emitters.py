@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_gi.kernels.alias import alias_choice_small
+from warp_gi.kernels.alias import alias_choice
 from warp_gi.kernels.sampling import triangle_barycentrics
 from warp_gi.kernels.surface import emitted_radiance
 from warp_gi.kernels.types import (
@@ -55,12 +55,12 @@ def distance_falloff(distance: wp.float32, range: wp.float32) -> wp.float32:
 
 # One sample of one emitter, as seen from `position`.
 @wp.func
-def sample_emitter(scene: SceneData, position: wp.vec3, u_select: wp.float32, u: wp.vec2) -> LightSample:
+def sample_emitter(scene: SceneData, position: wp.vec3, u_select: wp.vec2, u: wp.vec2) -> LightSample:
     r = LightSample()
     e = scene.emitters
     if e.count == 0:
         return r
-    choice = alias_choice_small(e.alias, e.count, u_select)
+    choice = alias_choice(e.alias, e.count, u_select[0], u_select[1])
     light = e.emitters[choice.item]
     if light.kind == EMITTER_TRIANGLE:
         b = triangle_barycentrics(u)

@@ -7,7 +7,8 @@ a node (half way to its neighbours, so half a cell high at the poles) and is uni
 
 import warp as wp
 
-from warp_gi.kernels.alias import alias_choice
+from warp_gi.kernels.alias import alias_choice, alias_prefetch
+from warp_gi.kernels.sampling import circle
 from warp_gi.kernels.types import ENVIRONMENT_CONSTANT, ENVIRONMENT_MAP, Environment
 
 wp.set_module_options({"enable_backward": False})
@@ -20,8 +21,13 @@ UNIFORM_SPHERE_PDF = wp.constant(wp.float32(0.07957747154594767))  # 1 / (4 pi)
 @wp.struct
 class EnvironmentSample:
     direction: wp.vec3  # unit, world space, towards the sky
-    radiance: wp.vec3  # W/(m^2 sr)
     pdf: wp.float32  # 1/sr; 0 if there is nothing to sample
+
+
+@wp.struct
+class EnvironmentLookup:
+    radiance: wp.vec3  # W/(m^2 sr)
+    pdf: wp.float32  # 1/sr
 
 
 # Latitude-longitude coordinates in [0, 1) x [0, 1] of a unit direction in environment space.
@@ -90,20 +96,40 @@ def environment_radiance(env: Environment, direction: wp.vec3) -> wp.vec3:
     return wp.vec3(0.0, 0.0, 0.0)
 
 
+# Probability density [1/sr] of the cell that holds latitude-longitude coordinates.
+@wp.func
+def cell_pdf(env: Environment, uv: wp.vec2) -> wp.float32:
+    column = wp.min(wp.int32(uv[0] * wp.float32(env.width)), env.width - 1)
+    row = wp.min(wp.int32(uv[1] * wp.float32(env.height - 1) + 0.5), env.height - 1)
+    return env.alias[row * env.width + column].pdf / cell_solid_angle(row_bounds(row, env.height), env.width)
+
+
 # Probability density [1/sr] with which environment_sample yields a unit direction in world space.
 @wp.func
 def environment_pdf(env: Environment, direction: wp.vec3) -> wp.float32:
     if env.kind == ENVIRONMENT_MAP:
-        uv = lat_long_encode(env.environment_from_world * direction)
-        column = wp.clamp(wp.int32(uv[0] * wp.float32(env.width)), 0, env.width - 1)
-        row = wp.clamp(wp.int32(uv[1] * wp.float32(env.height - 1) + 0.5), 0, env.height - 1)
-        return env.alias[row * env.width + column].pdf / cell_solid_angle(row_bounds(row, env.height), env.width)
+        return cell_pdf(env, lat_long_encode(env.environment_from_world * direction))
     if env.kind == ENVIRONMENT_CONSTANT:
         return UNIFORM_SPHERE_PDF
     return 0.0
 
 
-# A direction with a density close to its radiance, from three uniform numbers in [0, 1):
+# Radiance and pdf of a direction at the cost of one.
+@wp.func
+def environment_lookup(env: Environment, direction: wp.vec3) -> EnvironmentLookup:
+    r = EnvironmentLookup()
+    if env.kind == ENVIRONMENT_MAP:
+        uv = lat_long_encode(env.environment_from_world * direction)
+        r.radiance = bilinear_radiance(env, uv)
+        r.pdf = cell_pdf(env, uv)
+    else:
+        r.radiance = environment_radiance(env, direction)
+        r.pdf = environment_pdf(env, direction)
+    return r
+
+
+# A direction with a density close to the radiance from there (not looked up: most samples turn out to
+# be occluded, and each lookup in a map waits for memory), from three uniform numbers in [0, 1):
 # u[0] picks a bucket of the alias table, u[2] its side and then the azimuth, u[1] the polar angle.
 @wp.func
 def environment_sample(env: Environment, u: wp.vec3) -> EnvironmentSample:
@@ -120,25 +146,26 @@ def environment_sample(env: Environment, u: wp.vec3) -> EnvironmentSample:
         if below:
             begin = PI - bounds[0]
             end = PI - bounds[1]
-        sin_begin = wp.sin(0.5 * begin)
-        sin_end = wp.sin(0.5 * end)
+        sin_begin = circle(begin / (2.0 * TWO_PI))[1]
+        sin_end = circle(end / (2.0 * TWO_PI))[1]
         square = wp.lerp(sin_begin * sin_begin, sin_end * sin_end, u[1])
         cos_theta = 1.0 - 2.0 * square
-        sin_theta = 2.0 * wp.sqrt(square * (1.0 - square))
-        theta = 2.0 * wp.asin(wp.sqrt(square))
         if below:
             cos_theta = -cos_theta
-            theta = PI - theta
-        uv = wp.vec2((wp.float32(column) + choice.remainder) / wp.float32(env.width), theta / PI)
-        phi = uv[0] * TWO_PI
-        local = wp.vec3(sin_theta * wp.sin(phi), cos_theta, -sin_theta * wp.cos(phi))
+        around = circle((wp.float32(column) + choice.remainder) / wp.float32(env.width))
+        around = around * (2.0 * wp.sqrt(square * (1.0 - square)))
+        local = wp.vec3(around[1], cos_theta, -around[0])
         result.direction = wp.transpose(env.environment_from_world) * local
-        result.radiance = bilinear_radiance(env, uv)
         result.pdf = choice.pdf / cell_solid_angle(bounds, env.width)
     elif env.kind == ENVIRONMENT_CONSTANT:
         z = 1.0 - 2.0 * u[1]
         r = wp.sqrt(wp.max(0.0, 1.0 - z * z))
         result.direction = wp.vec3(r * wp.cos(TWO_PI * u[0]), z, r * wp.sin(TWO_PI * u[0]))
-        result.radiance = env.radiance
         result.pdf = UNIFORM_SPHERE_PDF
     return result
+
+
+# Starts fetching what environment_sample(env, u) will read first.
+@wp.func
+def environment_prefetch(env: Environment, u: wp.vec3):
+    alias_prefetch(env.alias, env.width * env.height, u[0])

@@ -13,10 +13,15 @@ import warp as wp
 from warp_gi.kernels.bsdf import bsdf_evaluate, bsdf_sample
 from warp_gi.kernels.bvh import BvhHit, bvh_intersect, bvh_occluded
 from warp_gi.kernels.emitters import sample_emitter, triangle_light_pdf
-from warp_gi.kernels.environment import environment_pdf, environment_radiance, environment_sample
+from warp_gi.kernels.environment import (
+    environment_lookup,
+    environment_prefetch,
+    environment_radiance,
+    environment_sample,
+)
 from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, tiled_pixel
-from warp_gi.kernels.sampling import balance, pixel_sample_index, pixel_seed, sample_1d, sample_2d
-from warp_gi.kernels.surface import Surface, emitted_radiance, ray_origin, surface_at
+from warp_gi.kernels.sampling import balance, pixel_sample_index, pixel_seed, random_1d, sample_1d, sample_2d
+from warp_gi.kernels.surface import Surface, emitted_radiance, ray_origin, surface_at, surface_prefetch
 from warp_gi.kernels.types import ENVIRONMENT_MAP, ENVIRONMENT_NONE, SceneData
 
 wp.set_module_options({"enable_backward": False})
@@ -66,13 +71,13 @@ def sky_light(scene: SceneData, s: Surface, wo: wp.vec3, u: wp.vec3, share: wp.f
         return wp.vec3(0.0, 0.0, 0.0)
     if bvh_occluded(scene.bvh, ray_origin(s), e.direction, float(wp.inf)):
         return wp.vec3(0.0, 0.0, 0.0)
-    return wp.cw_mul(f.value, e.radiance) / (e.pdf * share + f.pdf)
+    return wp.cw_mul(f.value, environment_radiance(scene.environment, e.direction)) / (e.pdf * share + f.pdf)
 
 
 # Light sample of one emitter, weighted; `share` is the probability that it is taken.
 @wp.func
 def emitter_light(
-    scene: SceneData, s: Surface, wo: wp.vec3, u_select: wp.float32, u: wp.vec2, share: wp.float32
+    scene: SceneData, s: Surface, wo: wp.vec3, u_select: wp.vec2, u: wp.vec2, share: wp.float32
 ) -> wp.vec3:
     origin = ray_origin(s)
     e = sample_emitter(scene, origin, u_select, u)
@@ -113,27 +118,59 @@ def trace_path(
         at_first = depth == 2
         d = 1 + (depth - 2) * DIMENSIONS
         wo = wp.transpose(s.shading) * view
-        # light sampling: both strategies at the first vertex, where they are two terms; else one of them
+        # which lights to sample: both at the first vertex, where they are two terms; else one of them
         sky_share = paths.sky_probability
         emitter_share = 1.0 - sky_share
         wants_sky = has_sky_map
         wants_emitter = scene.emitters.count > 0
-        u_select = float(0.0)
-        if has_sky_map or wants_emitter:
-            u_select = sample_1d(index, seed, d)
+        u_select = wp.vec2(0.0, 0.0)
+        if wants_emitter:
+            u_select = wp.vec2(sample_1d(index, seed, d), random_1d(index, seed, d))
         if at_first:
             sky_share = 1.0
             emitter_share = 1.0
             wants_sky = has_sky_map and (paths.terms & TERM_ENVIRONMENT) != 0
             wants_emitter = wants_emitter and (paths.terms & TERM_EMITTERS) != 0
-        elif u_select < sky_share:
+        elif u_select[0] < sky_share:
             wants_emitter = False
         else:
             wants_sky = False
-            u_select = (u_select - sky_share) / emitter_share
+            u_select = wp.vec2((u_select[0] - sky_share) / emitter_share, u_select[1])
+        u_sky = wp.vec3(0.0, 0.0, 0.0)
         if wants_sky:
             u2 = sample_2d(index, seed, d + 1)
-            light = sky_light(scene, s, wo, wp.vec3(u2[0], u2[1], sample_1d(index, seed, d + 2)), sky_share)
+            u_sky = wp.vec3(u2[0], u2[1], random_1d(index, seed, d + 2))
+            environment_prefetch(scene.environment, u_sky)
+
+        # BSDF sampling: ends the path at a light, or continues it
+        is_last = depth == paths.max_depth or (at_first and (paths.terms & TERM_INDIRECT) == 0)
+        sees_sky = scene.environment.kind != ENVIRONMENT_NONE
+        sees_emitters = scene.emitters.count > 0
+        if at_first:
+            sees_sky = sees_sky and (paths.terms & TERM_ENVIRONMENT) != 0
+            sees_emitters = sees_emitters and (paths.terms & TERM_EMITTERS) != 0
+        u_lobe = float(0.0)
+        if s.bsdf.f90 > 0.0:
+            u_lobe = sample_1d(index, seed, d + 4)
+        b = bsdf_sample(s.bsdf, wo, u_lobe, sample_2d(index, seed, d + 5))
+        wi = s.shading * b.wi
+        goes_on = b.pdf > 0.0 and wp.dot(wi, s.normal) > 0.0
+        if is_last and not sees_sky and not sees_emitters:
+            goes_on = False
+        hit = BvhHit()
+        hit.face = -1
+        if goes_on:
+            origin = ray_origin(s)
+            if is_last and not sees_emitters:
+                goes_on = not bvh_occluded(scene.bvh, origin, wi, float(wp.inf))
+            else:
+                hit = bvh_intersect(scene.bvh, origin, wi, float(wp.inf))
+                if hit.face >= 0:
+                    surface_prefetch(scene.geometry, hit.face)
+
+        # light sampling; after the ray above, which gives memory the time to answer the prefetches
+        if wants_sky:
+            light = sky_light(scene, s, wo, u_sky, sky_share)
             if at_first:
                 r.environment = light
             else:
@@ -144,37 +181,15 @@ def trace_path(
                 r.emitters = light
             else:
                 r.indirect = r.indirect + wp.cw_mul(throughput, light)
-
-        # BSDF sampling: ends a path at a light, or continues it
-        u_lobe = float(0.0)
-        if s.bsdf.f90 > 0.0:
-            u_lobe = sample_1d(index, seed, d + 4)
-        b = bsdf_sample(s.bsdf, wo, u_lobe, sample_2d(index, seed, d + 5))
-        wi = s.shading * b.wi
-        if b.pdf <= 0.0 or wp.dot(wi, s.normal) <= 0.0:
+        if not goes_on:
             break
         throughput = wp.cw_mul(throughput, b.weight)
-        is_last = depth == paths.max_depth or (at_first and (paths.terms & TERM_INDIRECT) == 0)
-        sees_sky = scene.environment.kind != ENVIRONMENT_NONE
-        sees_emitters = scene.emitters.count > 0
-        if at_first:
-            sees_sky = sees_sky and (paths.terms & TERM_ENVIRONMENT) != 0
-            sees_emitters = sees_emitters and (paths.terms & TERM_EMITTERS) != 0
-        if is_last and not sees_sky and not sees_emitters:
-            break
-        origin = ray_origin(s)
-        hit = BvhHit()
-        hit.face = -1
-        if is_last and not sees_emitters:
-            if bvh_occluded(scene.bvh, origin, wi, float(wp.inf)):
-                break
-        else:
-            hit = bvh_intersect(scene.bvh, origin, wi, float(wp.inf))
         if hit.face < 0:
             if sees_sky:
-                light = wp.cw_mul(throughput, environment_radiance(scene.environment, wi))
+                sky = environment_lookup(scene.environment, wi)
+                light = wp.cw_mul(throughput, sky.radiance)
                 if has_sky_map:
-                    light = light * balance(b.pdf, sky_share * environment_pdf(scene.environment, wi))
+                    light = light * balance(b.pdf, sky_share * sky.pdf)
                 if at_first:
                     r.environment = r.environment + light
                 else:
@@ -193,7 +208,7 @@ def trace_path(
             break
         if depth >= paths.roulette_depth:
             survival = wp.min(wp.max(throughput), 0.95)
-            if sample_1d(index, seed, d + 6) >= survival:
+            if random_1d(index, seed, d + 6) >= survival:
                 break
             throughput = throughput / survival
         view = -wi

@@ -18,11 +18,11 @@ _INTEGER_CODE = """
 typedef unsigned int Word;
 struct Bits {
     static CUDA_CALLABLE inline Word reverse(Word x) {
-        x = ((x >> 1) & 0x55555555u) | ((x & 0x55555555u) << 1);
-        x = ((x >> 2) & 0x33333333u) | ((x & 0x33333333u) << 2);
-        x = ((x >> 4) & 0x0f0f0f0fu) | ((x & 0x0f0f0f0fu) << 4);
-        x = ((x >> 8) & 0x00ff00ffu) | ((x & 0x00ff00ffu) << 8);
-        return (x >> 16) | (x << 16);
+#if defined(__CUDA_ARCH__)
+        return __brev(x);
+#else
+        return __builtin_bitreverse32(x);
+#endif
     }
     static CUDA_CALLABLE inline Word hash(Word x) {
         x ^= x >> 16; x *= 0x21f0aaadu; x ^= x >> 15; x *= 0x735a2d97u; x ^= x >> 15;
@@ -90,6 +90,34 @@ def sample_2d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32) -> wp.vec2
 def sample_1d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32) -> wp.float32: ...
 
 
+# Number in [0, 1) that is only random: for decisions that gain nothing from being stratified.
+@wp.func_native(
+    snippet=_INTEGER_CODE
+    + """
+    return Bits::unit(Bits::hash(index ^ Bits::hash(seed + Bits::hash((Word)dimension + 0x85ebca6bu))));
+"""
+)
+def random_1d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32) -> wp.float32: ...
+
+
+# (cos, sin) of 2 pi u for u in [0, 1]; polynomials, so no call breaks a loop, and every machine agrees.
+@wp.func
+def circle(u: wp.float32) -> wp.vec2:
+    quarter = wp.floor(4.0 * u + 0.5)
+    a = (u - 0.25 * quarter) * (2.0 * wp.pi)  # in [-pi/4, pi/4]
+    a2 = a * a
+    c = 1.0 + a2 * (-0.5 + a2 * (4.166664568e-2 + a2 * (-1.388731625e-3 + a2 * 2.443315711e-5)))
+    s = a * (1.0 + a2 * (-1.666666546e-1 + a2 * (8.332160873e-3 + a2 * -1.951529589e-4)))
+    k = wp.int32(quarter) & 3
+    if k == 0:
+        return wp.vec2(c, s)
+    if k == 1:
+        return wp.vec2(-s, c)
+    if k == 2:
+        return wp.vec2(-c, -s)
+    return wp.vec2(s, -c)
+
+
 # Index in the sequence of sample `sample` of a pixel with 2^sample_bits samples reserved.
 # Pixels 2^((32 - sample_bits) / 2) apart share indices; `pixel_seed` tells them apart.
 @wp.func
@@ -110,9 +138,8 @@ def pixel_seed(x: wp.int32, y: wp.int32, sample_bits: wp.int32, seed: wp.uint32)
 # Cosine-weighted direction about +z (Malley's method); pdf = z / pi.
 @wp.func
 def cosine_direction(u: wp.vec2) -> wp.vec3:
-    radius = wp.sqrt(u[0])
-    angle = 2.0 * wp.pi * u[1]
-    return wp.vec3(radius * wp.cos(angle), radius * wp.sin(angle), wp.sqrt(wp.max(0.0, 1.0 - u[0])))
+    c = circle(u[1]) * wp.sqrt(u[0])
+    return wp.vec3(c[0], c[1], wp.sqrt(wp.max(0.0, 1.0 - u[0])))
 
 
 # Barycentric weights of the second and third corner, uniform over the triangle.

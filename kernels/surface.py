@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_gi.kernels.bsdf import Bsdf, make_bsdf
 from warp_gi.kernels.sampling import frame_of
-from warp_gi.kernels.types import WRAP_CLAMP, WRAP_MIRROR, WRAP_REPEAT, SceneData
+from warp_gi.kernels.types import WRAP_CLAMP, WRAP_MIRROR, WRAP_REPEAT, Geometry, SceneData, Texture
 
 wp.set_module_options({"enable_backward": False})
 
@@ -128,12 +128,49 @@ def mapped_normal(
     return wp.normalize(tangent * x + bitangent * y + n * z)
 
 
+# Starts fetching the texels around a point of a texture with coordinates in [0, 1).
+@wp.func_native(
+    snippet="""
+#if !defined(__CUDA_ARCH__)
+    const float x = (u - __builtin_floorf(u)) * (float)texture.width - 0.5f;
+    const float y = (v - __builtin_floorf(v)) * (float)texture.height - 0.5f;
+    const int i = x > 0.0f ? (int)x : 0, j = y > 0.0f ? (int)y : 0;
+    if (i < texture.width && j < texture.height) {
+        const wp::uint32* texel = &texels.data[texture.start + j * texture.width + i];
+        __builtin_prefetch(texel);
+        if (j + 1 < texture.height) __builtin_prefetch(texel + texture.width);
+    }
+#endif
+"""
+)
+def texture_prefetch(texels: wp.array(dtype=wp.uint32), texture: Texture, u: wp.float32, v: wp.float32): ...
+
+
+# Starts fetching what surface_at and emission will read first of a triangle.
+@wp.func_native(
+    snippet="""
+#if !defined(__CUDA_ARCH__)
+    __builtin_prefetch(&geometry.indices.data[face]);
+    __builtin_prefetch(&geometry.emitters.data[face]);
+    __builtin_prefetch(&geometry.materials.data[face]);
+#endif
+"""
+)
+def surface_prefetch(geometry: Geometry, face: wp.int32): ...
+
+
 # Everything about the point (u, v) of triangle `face`, seen from direction wo.
 @wp.func
 def surface_at(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, wo: wp.vec3) -> Surface:
     s = Surface()
     g = scene.geometry
     ids = g.indices[face]
+    m = scene.materials[g.materials[face]]
+    uv = wp.vec2(0.0, 0.0)
+    if m.base_color_texture >= 0 or m.metallic_roughness_texture >= 0 or m.normal_texture >= 0:
+        uv = triangle_uv(scene, face, u, v)
+    if m.base_color_texture >= 0:
+        texture_prefetch(scene.texels, scene.textures[m.base_color_texture], uv[0], uv[1])
     p0 = g.points[ids[0]]
     p1 = g.points[ids[1]]
     p2 = g.points[ids[2]]
@@ -147,13 +184,9 @@ def surface_at(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, w
         shading = shading / length
     else:
         shading = normal
-    m = scene.materials[g.materials[face]]
     base = m.base_color
     roughness = m.roughness
     metallic = m.metallic
-    uv = wp.vec2(0.0, 0.0)
-    if m.base_color_texture >= 0 or m.metallic_roughness_texture >= 0 or m.normal_texture >= 0:
-        uv = triangle_uv(scene, face, u, v)
     if m.base_color_texture >= 0:
         texel = texture_lookup(scene, m.base_color_texture, uv)
         base = wp.cw_mul(base, wp.vec3(texel[0], texel[1], texel[2]))

@@ -13,6 +13,7 @@ from warp_gi.alias import AliasTable
 from warp_gi.errors import OptionError, SceneError
 from warp_gi.kernels.alias import alias_choice, alias_choice_small
 from warp_gi.kernels.environment import (
+    environment_lookup,
     environment_pdf,
     environment_radiance,
     environment_sample,
@@ -39,7 +40,7 @@ def sample_directions(
     i = first + wp.tid()
     s = environment_sample(env, numbers[i])
     directions[i] = s.direction
-    radiance[i] = s.radiance
+    radiance[i] = environment_lookup(env, s.direction).radiance
     pdf[i] = s.pdf
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+
 from warp_gi.kernels import sampling
 from warp_gi.launch import launch
 
@@ -34,6 +35,12 @@ def draw_pairs(
 def build_frames(first: wp.int32, normals: wp.array(dtype=wp.vec3), frames: wp.array(dtype=wp.mat33)):
     i = first + wp.tid()
     frames[i] = sampling.frame_of(normals[i])
+
+
+@wp.kernel
+def evaluate_circle(first: wp.int32, u: wp.array(dtype=wp.float32), points: wp.array(dtype=wp.vec2)):
+    i = first + wp.tid()
+    points[i] = sampling.circle(u[i])
 
 
 def samples(width=8, height=8, spp=4, seed=1, dimension=3):
@@ -102,3 +109,11 @@ def test_frames_are_rotations():
     assert np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max() < 1e-5
     assert np.abs(np.linalg.det(matrices) - 1).max() < 1e-5
     assert np.abs(matrices[:, :, 2] - normals).max() < 1e-6
+
+
+def test_circle_is_cosine_and_sine():
+    u = np.linspace(0, 1, 100_001).astype(np.float32)
+    points = wp.zeros(len(u), dtype=wp.vec2, device=CPU)
+    launch(evaluate_circle, len(u), [wp.array(u, device=CPU), points], CPU)
+    angle = 2 * np.pi * u.astype(np.float64)
+    assert np.abs(points.numpy() - np.stack([np.cos(angle), np.sin(angle)], axis=1)).max() < 2e-7

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from warp_gi.kernels import types
+from warp_gi.launch import on_device
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +27,7 @@ class AliasTable:
         buckets = np.empty(len(self.pdf), types.AliasBucket.numpy_dtype())
         buckets["probability"], buckets["index"] = self.probability, self.index
         buckets["pdf"], buckets["index_pdf"] = self.pdf, self.pdf[self.index]
-        return wp.array(buckets, dtype=types.AliasBucket, device=device)
+        return on_device(buckets, types.AliasBucket, device)
 
     @staticmethod
     def build(weights: np.ndarray) -> AliasTable:

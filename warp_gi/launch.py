@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -73,6 +74,15 @@ def get_device(name: str | None) -> wp.Device:
     except (RuntimeError, ValueError) as error:
         known = ", ".join(device.alias for device in wp.get_devices())
         raise OptionError(f"device {name!r} is not available ({error}); use one of: {known}") from error
+
+
+def on_device(values: np.ndarray, dtype: Any, device: wp.Device) -> wp.array:
+    """Return ``values`` as an array of ``dtype`` on a device; on the CPU it is the same memory.
+
+    NumPy asks for huge pages where an array is large (4 MB), which halves the cost of random access; Warp's
+    own allocator does not.
+    """
+    return wp.array(values, dtype=dtype, device=device, copy=not device.is_cpu)
 
 
 def load(kernel: wp.Kernel, device: wp.Device) -> None:

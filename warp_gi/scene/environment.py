@@ -26,7 +26,7 @@ import warp as wp
 from warp_gi.alias import AliasTable
 from warp_gi.errors import SceneError
 from warp_gi.kernels import types
-from warp_gi.launch import get_device
+from warp_gi.launch import get_device, on_device
 from warp_gi.scene.model import Color
 from warp_gi.scene.sky import SunSky, node_solid_angles
 
@@ -58,7 +58,7 @@ class _Map:
         """Return texels and alias table on the device."""
         if device.alias not in self.arrays:
             table = AliasTable.build(_cell_weights(self.pixels))
-            texels = wp.array(self.pixels.reshape(-1, 3), dtype=wp.vec3, device=device)
+            texels = on_device(self.pixels.reshape(-1, 3), wp.vec3, device)
             self.arrays[device.alias] = (texels, table.on(device))
         return self.arrays[device.alias]
 

@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_gi.errors import SceneError, unknown_name
 from warp_gi.kernels import types
-from warp_gi.launch import get_device
+from warp_gi.launch import get_device, on_device
 from warp_gi.scene import animation, emitters, geometry, textures
 from warp_gi.scene.model import Keyframe, Material, Node, PunctualLight
 
@@ -294,8 +294,7 @@ class _DeviceScene:
         self.set_environment(scene.environment)
 
     def _array(self, values: np.ndarray, dtype: Any) -> wp.array:
-        """Return ``values`` on the device; on the CPU the same memory."""
-        return wp.array(values, dtype=dtype, device=self.device, copy=not self.device.is_cpu)
+        return on_device(values, dtype, self.device)
 
     def set_environment(self, environment: Environment | None) -> None:
         self.data.environment = types.Environment() if environment is None else environment.data(self.device)
