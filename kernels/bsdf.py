@@ -35,7 +35,7 @@ class BsdfValue:
     pdf: wp.float32
 
 
-# weight = f * cos(wi) / pdf; pdf is 0 where sampling failed.
+# weight = f * cos(wi) / pdf, but see bsdf_weight; pdf is 0 where sampling failed.
 @wp.struct
 class BsdfSample:
     wi: wp.vec3
@@ -147,3 +147,12 @@ def bsdf_sample(b: Bsdf, wo: wp.vec3, u_lobe: wp.float32, u: wp.vec2) -> BsdfSam
         r.pdf = value.pdf
         r.weight = value.value / value.pdf
     return r
+
+
+# f * cos(wi) / pdf of a sample. That of a Lambert material is its colour now, whatever it was when the
+# sample was drawn: the direction does not depend on it.
+@wp.func
+def bsdf_weight(b: Bsdf, sample: BsdfSample) -> wp.vec3:
+    if b.f90 <= 0.0:
+        return b.diffuse
+    return sample.weight

@@ -5,7 +5,7 @@ import warp as wp
 from warp_gi.kernels.bvh import bvh_intersect
 from warp_gi.kernels.environment import environment_radiance
 from warp_gi.kernels.sampling import filter_offset, pixel_sample_index, pixel_seed, sample_2d
-from warp_gi.kernels.surface import surface_at
+from warp_gi.kernels.surface import surface_at, surface_emission
 from warp_gi.kernels.types import SceneData
 
 wp.set_module_options({"enable_backward": False})
@@ -136,7 +136,7 @@ def shade_primary(
         buffers.emission[pixel] = buffers.emission[pixel] + environment_radiance(scene.environment, direction)
     else:
         s = surface_at(scene, face, u, v, -direction)
-        buffers.emission[pixel] = buffers.emission[pixel] + s.emission
+        buffers.emission[pixel] = buffers.emission[pixel] + surface_emission(scene, face, u, v, -direction)
         buffers.albedo[pixel] = buffers.albedo[pixel] + s.base_color
         buffers.normal[pixel] = buffers.normal[pixel] + wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
         if settings.camera_sample == 0:

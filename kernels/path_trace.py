@@ -10,7 +10,7 @@ alone, which is better than any mixture for it.
 
 import warp as wp
 
-from warp_gi.kernels.bsdf import bsdf_evaluate, bsdf_sample
+from warp_gi.kernels.bsdf import bsdf_evaluate, bsdf_sample, bsdf_weight
 from warp_gi.kernels.bvh import BvhHit, bvh_intersect, bvh_occluded
 from warp_gi.kernels.emitters import sample_emitter, triangle_light_pdf
 from warp_gi.kernels.environment import (
@@ -21,7 +21,15 @@ from warp_gi.kernels.environment import (
 )
 from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, tiled_pixel
 from warp_gi.kernels.sampling import balance, pixel_sample_index, pixel_seed, random_1d, sample_1d, sample_2d
-from warp_gi.kernels.surface import Surface, emitted_radiance, ray_origin, surface_at, surface_prefetch
+from warp_gi.kernels.surface import (
+    Surface,
+    ray_origin,
+    surface_at,
+    surface_emission,
+    surface_prefetch,
+    surface_shape,
+    with_color,
+)
 from warp_gi.kernels.types import ENVIRONMENT_MAP, ENVIRONMENT_NONE, SceneData
 
 wp.set_module_options({"enable_backward": False})
@@ -93,17 +101,6 @@ def emitter_light(
     return wp.cw_mul(f.value, e.radiance) / (e.pdf * share + f.pdf)
 
 
-# Radiance emitted at a hit against the direction wi of the ray that found it.
-@wp.func
-def hit_emission(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, wi: wp.vec3) -> wp.vec3:
-    if scene.materials[scene.geometry.materials[face]].double_sided == 0:
-        ids = scene.geometry.indices[face]
-        p0 = scene.geometry.points[ids[0]]
-        if wp.dot(wp.cross(scene.geometry.points[ids[1]] - p0, scene.geometry.points[ids[2]] - p0), wi) >= 0.0:
-            return wp.vec3(0.0, 0.0, 0.0)
-    return emitted_radiance(scene, face, u, v)
-
-
 # Follows one path from the first hit `surface`, seen from direction `towards_camera`.
 @wp.func
 def trace_path(
@@ -168,6 +165,8 @@ def trace_path(
                 if hit.face >= 0:
                     surface_prefetch(scene.geometry, hit.face)
 
+        if goes_on or wants_sky or wants_emitter:
+            s = with_color(scene, s)
         # light sampling; after the ray above, which gives memory the time to answer the prefetches
         if wants_sky:
             light = sky_light(scene, s, wo, u_sky, sky_share)
@@ -183,7 +182,7 @@ def trace_path(
                 r.indirect = r.indirect + wp.cw_mul(throughput, light)
         if not goes_on:
             break
-        throughput = wp.cw_mul(throughput, b.weight)
+        throughput = wp.cw_mul(throughput, bsdf_weight(s.bsdf, b))
         if hit.face < 0:
             if sees_sky:
                 sky = environment_lookup(scene.environment, wi)
@@ -197,7 +196,7 @@ def trace_path(
             break
         emitter = scene.geometry.emitters[hit.face]
         if sees_emitters and emitter >= 0:
-            light = wp.cw_mul(throughput, hit_emission(scene, hit.face, hit.u, hit.v, wi))
+            light = wp.cw_mul(throughput, surface_emission(scene, hit.face, hit.u, hit.v, -wi))
             pdf = triangle_light_pdf(scene, emitter, hit.face, wi, hit.t)
             light = light * balance(b.pdf, emitter_share * pdf)
             if at_first:
@@ -212,7 +211,7 @@ def trace_path(
                 break
             throughput = throughput / survival
         view = -wi
-        s = surface_at(scene, hit.face, hit.u, hit.v, view)
+        s = surface_shape(scene, hit.face, hit.u, hit.v, view)
     return r
 
 
@@ -240,6 +239,7 @@ def trace_paths(
         buffers.moment2[pixel] = buffers.moment2[pixel] + wp.cw_mul(sky, sky) * count
         return
     s = surface_at(scene, face, hits.u[pixel], hits.v[pixel], -direction)
+    emission = surface_emission(scene, face, hits.u[pixel], hits.v[pixel], -direction)
     seed = pixel_seed(p[0], p[1], settings.sample_bits, settings.seed)
     environment = wp.vec3(0.0, 0.0, 0.0)
     emitters = wp.vec3(0.0, 0.0, 0.0)
@@ -255,7 +255,7 @@ def trace_paths(
         environment = environment + r.environment
         emitters = emitters + r.emitters
         indirect = indirect + r.indirect
-        beauty = s.emission + r.environment + r.emitters + r.indirect
+        beauty = emission + r.environment + r.emitters + r.indirect
         moment1 = moment1 + beauty
         moment2 = moment2 + wp.cw_mul(beauty, beauty)
     buffers.environment[pixel] = buffers.environment[pixel] + environment

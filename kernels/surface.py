@@ -17,7 +17,8 @@ class Surface:
     shading: wp.mat33  # world_from_shading; its third column is the shading normal
     bsdf: Bsdf
     base_color: wp.vec3
-    emission: wp.vec3  # towards wo
+    uv: wp.vec2
+    texture: wp.int32  # of base_color that is not looked up yet, or -1
     offset: wp.float32  # metres by which rays leave along `normal`
 
 
@@ -82,7 +83,7 @@ def triangle_uv(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32) 
     return uvs[ids[0]] * (1.0 - u - v) + uvs[ids[1]] * u + uvs[ids[2]] * v
 
 
-# Radiance that a triangle emits at a point, on its emitting side.
+# Radiance at a point of an emissive triangle, on its emitting side.
 @wp.func
 def emitted_radiance(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32) -> wp.vec3:
     m = scene.materials[scene.geometry.materials[face]]
@@ -90,6 +91,19 @@ def emitted_radiance(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.floa
         return m.emission
     texel = texture_lookup(scene, m.emission_texture, triangle_uv(scene, face, u, v))
     return wp.cw_mul(m.emission, wp.vec3(texel[0], texel[1], texel[2]))
+
+
+# Radiance that the point (u, v) of a triangle emits towards wo.
+@wp.func
+def surface_emission(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, wo: wp.vec3) -> wp.vec3:
+    if scene.geometry.emitters[face] < 0:
+        return wp.vec3(0.0, 0.0, 0.0)
+    if scene.materials[scene.geometry.materials[face]].double_sided == 0:
+        ids = scene.geometry.indices[face]
+        p0 = scene.geometry.points[ids[0]]
+        if wp.dot(wp.cross(scene.geometry.points[ids[1]] - p0, scene.geometry.points[ids[2]] - p0), wo) <= 0.0:
+            return wp.vec3(0.0, 0.0, 0.0)
+    return emitted_radiance(scene, face, u, v)
 
 
 # Distance by which a ray leaves the surface at `position`: above the rounding of positions
@@ -159,18 +173,33 @@ def texture_prefetch(texels: wp.array(dtype=wp.uint32), texture: Texture, u: wp.
 def surface_prefetch(geometry: Geometry, face: wp.int32): ...
 
 
-# Everything about the point (u, v) of triangle `face`, seen from direction wo.
+# The surface with its texture looked up.
 @wp.func
-def surface_at(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, wo: wp.vec3) -> Surface:
+def with_color(scene: SceneData, surface: Surface) -> Surface:
+    s = surface
+    if s.texture >= 0:
+        texel = texture_lookup(scene, s.texture, s.uv)
+        s.base_color = wp.cw_mul(s.base_color, wp.vec3(texel[0], texel[1], texel[2]))
+        s.bsdf.diffuse = s.base_color
+        s.texture = -1
+    return s
+
+
+# The point (u, v) of triangle `face` seen from direction wo, all but the texture of a Lambert
+# material: where to go on from there does not depend on it, so a path asks for it (`with_color`)
+# after the next ray, when it has arrived.
+@wp.func
+def surface_shape(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, wo: wp.vec3) -> Surface:
     s = Surface()
     g = scene.geometry
     ids = g.indices[face]
     m = scene.materials[g.materials[face]]
-    uv = wp.vec2(0.0, 0.0)
+    s.texture = -1
     if m.base_color_texture >= 0 or m.metallic_roughness_texture >= 0 or m.normal_texture >= 0:
-        uv = triangle_uv(scene, face, u, v)
+        s.uv = triangle_uv(scene, face, u, v)
     if m.base_color_texture >= 0:
-        texture_prefetch(scene.texels, scene.textures[m.base_color_texture], uv[0], uv[1])
+        s.texture = m.base_color_texture
+        texture_prefetch(scene.texels, scene.textures[m.base_color_texture], s.uv[0], s.uv[1])
     p0 = g.points[ids[0]]
     p1 = g.points[ids[1]]
     p2 = g.points[ids[2]]
@@ -184,25 +213,9 @@ def surface_at(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, w
         shading = shading / length
     else:
         shading = normal
-    base = m.base_color
-    roughness = m.roughness
-    metallic = m.metallic
-    if m.base_color_texture >= 0:
-        texel = texture_lookup(scene, m.base_color_texture, uv)
-        base = wp.cw_mul(base, wp.vec3(texel[0], texel[1], texel[2]))
-    if m.metallic_roughness_texture >= 0:
-        texel = texture_lookup(scene, m.metallic_roughness_texture, uv)
-        roughness = roughness * texel[1]
-        metallic = metallic * texel[2]
     if m.normal_texture >= 0:
-        shading = mapped_normal(scene, m.normal_texture, m.normal_scale, face, uv, shading)
-    s.base_color = base
-    s.bsdf = make_bsdf(base, metallic, roughness, m.specular)
-    front = wp.dot(normal, wo) > 0.0
-    if front or m.double_sided != 0:
-        if g.emitters[face] >= 0:
-            s.emission = emitted_radiance(scene, face, u, v)
-    if not front:
+        shading = mapped_normal(scene, m.normal_texture, m.normal_scale, face, s.uv, shading)
+    if wp.dot(normal, wo) < 0.0:
         normal = -normal
         shading = -shading
     s.normal = normal
@@ -211,7 +224,25 @@ def surface_at(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, w
     if slant < 1.0e-3:
         shading = wp.normalize(shading + wo * (1.0e-3 - slant) * 1.001)
     s.shading = frame_of(shading)
+    s.base_color = m.base_color
+    if m.metallic > 0.0 or m.specular > 0.0:
+        s = with_color(scene, s)
+        roughness = m.roughness
+        metallic = m.metallic
+        if m.metallic_roughness_texture >= 0:
+            texel = texture_lookup(scene, m.metallic_roughness_texture, s.uv)
+            roughness = roughness * texel[1]
+            metallic = metallic * texel[2]
+        s.bsdf = make_bsdf(s.base_color, metallic, roughness, m.specular)
+    else:
+        s.bsdf = make_bsdf(s.base_color, 0.0, 1.0, 0.0)
     return s
+
+
+# Everything about the point (u, v) of triangle `face`, seen from direction wo.
+@wp.func
+def surface_at(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, wo: wp.vec3) -> Surface:
+    return with_color(scene, surface_shape(scene, face, u, v, wo))
 
 
 # Where a ray starts that leaves the surface to the side of `normal`.
