@@ -87,6 +87,21 @@ def test_glowing_box_sums_its_bounces():
 
 
 @pytest.mark.parametrize("sky", SKIES)
+def test_all_is_one_radiance_in_equilibrium(sky):
+    """A sky of radiance 1 and surfaces that reflect half and emit half: every picture is 1, whatever is in it."""
+    glow = gi.Material("glow", (0.5, 0.5, 0.5), specular=0.0, emission=(0.5, 0.5, 0.5))
+    walls = [
+        quad((-2, 0, -1), (4, 0, 0), (0, 1.5, 0), glow, "back wall"),
+        quad((-1, 0, -1), (0, 0, 2), (0, 1, 0), glow, "side wall"),
+        sphere((0.3, 0.5, 0), 0.4, glow, rows=6),
+    ]
+    scene = scene_of(ground(glow), *walls, environment=SKIES[sky])
+    camera = gi.Camera.look_at((0.5, 0.8, 2.5), (0, 0.5, 0), hfov=50, resolution=(24, 16))
+    images = st.renderings(scene, camera, path(64, max_depth=18), 12)
+    st.assert_mean(images, 1.0, tolerance=1e-4)
+
+
+@pytest.mark.parametrize("sky", SKIES)
 def test_wall_blocks_its_share_of_the_sky(sky):
     """A black wall 1 m away hides its form factor (Howell, B-3) of a uniform sky: half of it if it is endless."""
     for height, half_length in ((1.0, 3.0), (1e3, 1e3)):
@@ -121,6 +136,8 @@ def test_parallel_rectangle_light(sampler):
     st.assert_mean(st.renderings(scene, camera, path(emitters=sampler), 12), expected, tolerance=1e-3)
     upward = quad((-0.5, 1.0, 0.75), (1.0, 0, 0), (0, 0, -1.5), light((3.0, 2.0, 1.0)), "lamp")
     assert (st.renderings(scene_of(ground(), upward), camera, path(emitters=sampler), 1) == 0).all()
+    plate = quad((-1, 0.97, 1), (2, 0, 0), (0, 0, -2), gi.Material("plate", (0, 0, 0), specular=0.0), "plate")
+    assert (st.renderings(scene_of(ground(), lamp, plate), camera, path(emitters=sampler), 1) == 0).all()
     both = gi.Material("lamp", (0, 0, 0), specular=0.0, emission=(3.0, 2.0, 1.0), double_sided=True)
     scene = scene_of(ground(), replace(upward, material=both))
     st.assert_mean(st.renderings(scene, camera, path(emitters=sampler), 12), expected, tolerance=1e-3)

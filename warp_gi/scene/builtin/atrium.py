@@ -391,4 +391,4 @@ def camera_path() -> CameraPath:
         CameraKey(0.0, VIEW[0], target, hfov=68.0),
         CameraKey(47 / 24, (x + 0.9, y + 0.15, z - 1.6), target, hfov=68.0),
     )
-    return CameraPath(keys, name="atrium")
+    return CameraPath(keys, resolution=(640, 360), name="atrium")
