@@ -11,6 +11,7 @@ import tyro
 
 from warp_gi import launch
 from warp_gi.bench import runner
+from warp_gi.cli_options import parse_options
 from warp_gi.cli_report import print_table, start_warp
 
 
@@ -32,7 +33,7 @@ class Bench:
 
 def main(arguments: Sequence[str]) -> int:
     """Run the command."""
-    options = tyro.cli(Bench, prog="warp-gi bench", args=arguments)
+    options = parse_options(Bench, "bench", arguments)
     if not options.suite:
         print_table("suites", ("name", "what it measures"), sorted(runner.suites().items()))
         return 0

@@ -11,6 +11,7 @@ import numpy as np
 import tyro
 
 from warp_gi import metrics
+from warp_gi.cli_options import parse_options
 from warp_gi.cli_report import print_table
 from warp_gi.errors import OptionError, SceneError
 from warp_gi.exr import read_exr, write_exr
@@ -44,7 +45,7 @@ class Compare:
 
 def main(arguments: Sequence[str]) -> int:
     """Run the command."""
-    options = tyro.cli(Compare, prog="warp-gi compare", args=arguments)
+    options = parse_options(Compare, "compare", arguments)
     image, reference = (read_image(path, options.layer) for path in (options.image, options.reference))
     if (image.dtype == np.uint8) != (reference.dtype == np.uint8):
         raise OptionError(f"{options.image} and {options.reference}: one is linear, one 8-bit sRGB; give two of a kind")

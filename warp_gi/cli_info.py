@@ -10,6 +10,7 @@ import tyro
 
 from warp_gi.camera import CameraPath
 from warp_gi.cli_inputs import open_scene
+from warp_gi.cli_options import parse_options
 from warp_gi.cli_report import print_table, start_warp
 from warp_gi.scene.model import Material
 from warp_gi.scene.scene import Scene
@@ -26,7 +27,7 @@ class Info:
 
 def main(arguments: Sequence[str]) -> int:
     """Run the command."""
-    options = tyro.cli(Info, prog="warp-gi info", args=arguments)
+    options = parse_options(Info, "info", arguments)
     start_warp()
     scene = open_scene(options.scene)
     print_table(options.scene, ("what", "value"), summary(scene))

@@ -18,6 +18,7 @@ import tyro
 from warp_gi import launch
 from warp_gi.camera import Camera, CameraPath
 from warp_gi.cli_inputs import DEFAULT_SCENE, find_camera, find_scene, parse_resolution
+from warp_gi.cli_options import parse_options
 from warp_gi.cli_report import Reporter, start_warp
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.files import remove_stale_parts
@@ -137,11 +138,11 @@ def parse(arguments: Sequence[str]) -> Render:
         elif argument.startswith("--pipeline="):
             chosen = argument.partition("=")[2]
     default = Render(settings=pipeline_named(chosen))
-    options = tyro.cli(
+    options = parse_options(
         Render,
-        prog="warp-gi render",
+        "render",
+        arguments,
         description=DESCRIPTION,
-        args=arguments,
         default=default,
         config=(tyro.conf.AvoidSubcommands,),
     )

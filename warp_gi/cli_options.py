@@ -1,0 +1,42 @@
+"""Options of a command from a dataclass, by tyro; its errors as one line."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import tyro
+
+from warp_gi.errors import OptionError
+
+Options = TypeVar("Options")
+
+
+def parse_options(options: type[Options], command: str, arguments: Sequence[str], **settings: Any) -> Options:
+    """Return ``options`` filled from the command line; ``settings`` go to ``tyro.cli``.
+
+    Raises OptionError for options that are unknown, missing or cannot be read.
+    """
+    report = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(report):
+            return tyro.cli(options, prog=f"warp-gi {command}", args=arguments, **settings)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        raise OptionError(_one_line(report.getvalue(), command)) from None
+
+
+def _one_line(report: str, command: str) -> str:
+    """Return what tyro's framed report says: its first part, and the first suggestion if it makes one."""
+    parts = [
+        " ".join(line.strip("│ ").strip() for line in part.splitlines() if line.strip("│╭╰╮╯─ ")).strip()
+        for part in re.split(r"│ ─+ │", re.sub(r"╭─.*─╮|╰─+╯", "", report))
+    ]
+    message = re.sub(r"\s+", " ", parts[0]).rstrip(". ")
+    suggestion = next((match for part in parts if (match := re.search(r"Perhaps you meant: (--[\w.-]+)", part))), None)
+    hint = f"; did you mean {suggestion.group(1)}?" if suggestion else ""
+    return f"{message}{hint} (see warp-gi {command} --help)"
