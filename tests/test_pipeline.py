@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import warp_gi as gi
-from warp_gi.camera import CameraKey
 from warp_gi.errors import OptionError
 from warp_gi.launch import set_threads
 
@@ -126,7 +125,7 @@ def test_surface_buffers_at_pixel_centres():
 
 
 def test_motion_of_a_moving_camera_points_to_the_last_frame():
-    keys = (CameraKey(0.0, (0, 0, 3.5), (0, 0, 0)), CameraKey(1.0, (1, 0.5, 3.5), (0.5, 0, 0)))
+    keys = (gi.CameraKey(0.0, (0, 0, 3.5), (0, 0, 0)), gi.CameraKey(1.0, (1, 0.5, 3.5), (0.5, 0, 0)))
     path = gi.CameraPath(keys, fps=2, resolution=SIZE)
     frame = next(gi.render(lit_scene(), path, gi.Pipeline(spp=1, camera_samples=1), frames=[1]))
     hit = frame.numpy("object_id").ravel() >= 0
@@ -150,7 +149,7 @@ def test_motion_of_a_moving_object_and_rest_around_it():
 
 def test_motion_of_the_sky_follows_the_turn_of_the_camera():
     """A card far away and small: everything else is sky."""
-    keys = (CameraKey(0.0, (0, 0, 9), (0, 0, 0)), CameraKey(1.0, (0, 0, 9), (-1, 0, 0)))
+    keys = (gi.CameraKey(0.0, (0, 0, 9), (0, 0, 0)), gi.CameraKey(1.0, (0, 0, 9), (-1, 0, 0)))
     path = gi.CameraPath(keys, fps=1, resolution=SIZE)
     scene = gi.Scene([gi.Node("card", [quad(half=0.1)])], environment=(1.0, 1.0, 1.0))
     frame = next(gi.render(scene, path, gi.Pipeline(spp=1, camera_samples=1), frames=[1]))

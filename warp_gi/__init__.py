@@ -31,6 +31,7 @@ _PUBLIC = {
     "builtin_scene": "warp_gi.scene.builtin",
     "Camera": "warp_gi.camera",
     "CameraPath": "warp_gi.camera",
+    "CameraKey": "warp_gi.camera",
     "Pipeline": "warp_gi.pipeline",
     "Estimator": "warp_gi.estimator",
     "TracedEnvironment": "warp_gi.techniques.baselines",
@@ -41,6 +42,9 @@ _PUBLIC = {
     "Frame": "warp_gi.scheduler",
     "render": "warp_gi.scheduler",
     "write_frame": "warp_gi.sequence",
+    "read_frame": "warp_gi.sequence",
+    "builtin_camera_path": "warp_gi.scene.builtin",
+    "AlphaMasks": "warp_gi.bvh",
     "set_threads": "warp_gi.launch",
 }
 _MODULES = ("metrics",)
