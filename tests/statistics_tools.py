@@ -14,10 +14,25 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pytest
+import warp as wp
 from scipy import stats
 
 ARTIFACTS = Path(os.environ.get("WARP_GI_ARTIFACTS", Path(__file__).parents[1] / "out" / "test_artifacts"))
 """Where failed tests leave pictures; the folder is ignored by git."""
+
+_device = "cpu"
+
+
+@pytest.fixture(params=["cpu", "cuda"] if wp.is_cuda_available() else ["cpu"], autouse=True)
+def every_device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run each test of a module that imports this fixture on the CPU, and on CUDA where there is a GPU."""
+    monkeypatch.setattr(f"{__name__}._device", request.param)
+
+
+def device() -> wp.Device:
+    """Return the device of the running test."""
+    return wp.get_device(_device)
 
 
 @dataclass(frozen=True)
@@ -209,14 +224,13 @@ def renderings(
     pipeline: object,
     count: int,
     buffer: str = "beauty",
-    device: str = "cpu",
     seed: int = 1,
 ) -> np.ndarray:
-    """Return ``count`` independent renderings of one view, float64 [count, height, width, channels]."""
+    """Return ``count`` independent renderings of a view on `device`, float64 [count, height, width, channels]."""
     import warp_gi as gi
 
     path = gi.CameraPath.still(camera)
-    frames = gi.render(scene, path, pipeline, frames=range(count), device=device, seed=seed)
+    frames = gi.render(scene, path, pipeline, frames=range(count), device=_device, seed=seed)
     return np.stack([frame.numpy(buffer).astype(np.float64) for frame in frames])
 
 

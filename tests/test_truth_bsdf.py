@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 import statistics_tools as st
 import warp as wp
+from statistics_tools import every_device  # noqa: F401
 
 from warp_gi.kernels.bsdf import bsdf_evaluate, bsdf_sample, make_bsdf
 from warp_gi.kernels.sampling import cosine_direction, sample_1d, sample_2d, triangle_barycentrics
@@ -13,7 +16,6 @@ from warp_gi.launch import launch
 
 wp.set_module_options({"enable_backward": False})
 
-CPU = wp.get_device("cpu")
 MATERIALS = {  # base colour, metallic, roughness, specular
     "lambert": ((0.8, 0.5, 0.2), 0.0, 1.0, 0.0),
     "plastic": ((0.8, 0.5, 0.2), 0.0, 0.3, 1.0),
@@ -88,18 +90,18 @@ def unit(v: object) -> np.ndarray:
 def evaluate(name: str, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
     """Return f * cos and pdf, float32 [n, 4], from the kernel."""
     wo, wi = (np.ascontiguousarray(np.broadcast_to(d, wi.shape), dtype=np.float32) for d in (wo, wi))
-    out = wp.empty(len(wi), dtype=wp.vec4, device=CPU)
-    arrays = [wp.array(parameters(name), dtype=wp.float32, device=CPU)]
-    arrays += [wp.array(d, dtype=wp.vec3, device=CPU) for d in (wo, wi)]
-    launch(evaluate_bsdf, len(wi), [*arrays, out], CPU)
+    out = wp.empty(len(wi), dtype=wp.vec4, device=st.device())
+    arrays = [wp.array(parameters(name), dtype=wp.float32, device=st.device())]
+    arrays += [wp.array(d, dtype=wp.vec3, device=st.device()) for d in (wo, wi)]
+    launch(evaluate_bsdf, len(wi), [*arrays, out], st.device())
     return out.numpy()
 
 
 def sample(name: str, wo: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return directions [n, 3] and weights with pdf [n, 4]; a failed sample is all zero."""
-    wi, weight = wp.empty(count, dtype=wp.vec3, device=CPU), wp.empty(count, dtype=wp.vec4, device=CPU)
-    material = wp.array(parameters(name), dtype=wp.float32, device=CPU)
-    launch(sample_bsdf, count, [material, wp.vec3(*wo), wi, weight], CPU)
+    wi, weight = wp.empty(count, dtype=wp.vec3, device=st.device()), wp.empty(count, dtype=wp.vec4, device=st.device())
+    material = wp.array(parameters(name), dtype=wp.float32, device=st.device())
+    launch(sample_bsdf, count, [material, wp.vec3(*wo), wi, weight], st.device())
     weight = weight.numpy()
     return np.where(weight[:, 3:] > 0, wi.numpy(), 0.0), weight
 
@@ -120,10 +122,13 @@ def gltf(name: str, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
     return np.where((n_l > 0)[:, None], value * n_l[:, None], 0.0)
 
 
+gauss_legendre = cache(np.polynomial.legendre.leggauss)
+
+
 def albedo(name: str, wo: np.ndarray) -> np.ndarray:
     """Directional albedo, float64 [3]: the integral of `gltf` over the hemisphere, in half vectors drawn by GGX."""
-    nodes, weights = np.polynomial.legendre.leggauss(400)
-    s, phi = (nodes + 1) / 2, np.pi * (np.arange(400) + 0.5) / 200
+    nodes, weights = gauss_legendre(256)
+    s, phi = (nodes + 1) / 2, 2 * np.pi * (np.arange(256) + 0.5) / 256
     alpha2 = max(MATERIALS[name][2] ** 2, 1e-3) ** 2
     z = np.sqrt((1 - s) / (1 + (alpha2 - 1) * s))[:, None] * np.ones_like(phi)
     ring = np.sqrt(1 - z * z)
@@ -189,9 +194,9 @@ def test_lambert_loses_nothing_and_smooth_white_metal_little():
 
 def warps(indices: np.ndarray, seeds: np.ndarray) -> list[np.ndarray]:
     count = len(indices)
-    inputs = [wp.array(x.astype(np.uint32), dtype=wp.uint32, device=CPU) for x in (indices, seeds)]
-    outputs = [wp.empty(count, dtype=t, device=CPU) for t in (wp.vec2, wp.vec3, wp.vec2)]
-    launch(sample_warps, count, [*inputs, *outputs], CPU)
+    inputs = [wp.array(x.astype(np.uint32), dtype=wp.uint32, device=st.device()) for x in (indices, seeds)]
+    outputs = [wp.empty(count, dtype=t, device=st.device()) for t in (wp.vec2, wp.vec3, wp.vec2)]
+    launch(sample_warps, count, [*inputs, *outputs], st.device())
     return [x.numpy() for x in outputs]
 
 

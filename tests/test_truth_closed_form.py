@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import statistics_tools as st
+from statistics_tools import every_device  # noqa: F401
 from test_truth_bsdf import MATERIALS, albedo, unit
 
 import warp_gi as gi
@@ -190,7 +191,7 @@ def small_scene() -> tuple[gi.Scene, gi.Camera]:
 
 def test_terms_add_up_to_beauty_and_each_stands_alone():
     scene, camera = small_scene()
-    frame = next(iter(gi.render(scene, camera, path(8, 4), seed=5)))
+    frame = next(iter(gi.render(scene, camera, path(8, 4), seed=5, device=str(st.device()))))
     terms = [frame.numpy(name) for name in ("emission", "environment", "emitters", "indirect")]
     assert all(term.max() > 0 for term in terms)
     assert np.array_equal(frame.numpy("beauty"), ((terms[0] + terms[1]) + terms[2]) + terms[3])
@@ -208,7 +209,7 @@ def test_threads_seeds_and_repetition():
     def image(seed: int, threads: int) -> np.ndarray:
         gi.set_threads(threads)
         try:
-            return next(iter(gi.render(scene, camera, path(4, 4), seed=seed))).numpy("beauty").copy()
+            return st.renderings(scene, camera, path(4, 4), 1, seed=seed)[0]
         finally:
             gi.set_threads(None)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import statistics_tools as st
+from statistics_tools import every_device  # noqa: F401
 
 import warp_gi as gi
 from warp_gi.bench.presets import PRESETS

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import statistics_tools as st
+from statistics_tools import every_device  # noqa: F401
 
 import warp_gi as gi
 from warp_gi.bench.presets import quad
@@ -45,7 +47,8 @@ def picture(material: gi.Material) -> tuple[gi.Frame, np.ndarray]:
     square = replace(square, uvs=(square.uvs * 3.4 - 1.3).astype(np.float32))
     scene = gi.Scene([gi.Node("square", [square])], environment=(1.0, 1.0, 1.0))
     camera = gi.Camera.look_at((0, 0, 1), (0, 0, 0), hfov=80.0, resolution=SIZE)
-    frame = next(iter(gi.render(scene, camera, gi.Pipeline(spp=1, camera_samples=1, indirect=None))))
+    pipeline = gi.Pipeline(spp=1, camera_samples=1, indirect=None)
+    frame = next(iter(gi.render(scene, camera, pipeline, device=str(st.device()))))
     half = np.tan(np.radians(40.0))
     x = (2 * (np.arange(SIZE[0]) + 0.5) / SIZE[0] - 1) * half
     y = (1 - 2 * (np.arange(SIZE[1]) + 0.5) / SIZE[1]) * half * SIZE[1] / SIZE[0]
