@@ -10,7 +10,7 @@ import warp_gi as gi
 from warp_gi import bvh as bvh_module
 from warp_gi.bvh import AlphaMasks, TriangleBvh
 from warp_gi.kernels import bvh as queries
-from warp_gi.kernels import types
+from warp_gi.kernels import bvh_rays, types
 from warp_gi.launch import launch
 
 CPU = wp.get_device("cpu")
@@ -249,6 +249,24 @@ def test_refit_follows_the_vertices():
         tree.refit(points[:3])
 
 
+def test_reordered_batches_give_the_same_hits_in_the_same_places(monkeypatch):
+    rng = np.random.default_rng(14)
+    points, indices = soup(rng, 3000, 0.05)
+    tree = TriangleBvh(points, indices)
+    origins, directions = rays(rng, 40000)
+    origins[17] = np.nan
+    limits = rng.uniform(0, 10, 40000).astype(np.float32)
+    plain, occluded = tree.intersect(origins, directions, limits), tree.occluded(origins, directions, limits)
+    monkeypatch.setattr(bvh_module, "ORDERED_OCCLUDED_BYTES", 0)
+    monkeypatch.setattr(bvh_module, "ORDERED_INTERSECT_BYTES", 0)
+    assert tree._order(wp.array(origins, dtype=wp.vec3, device=CPU)) is not None
+    assert tree._order(wp.array(np.sort(origins, axis=0) * 0.01, dtype=wp.vec3, device=CPU)) is None
+    ordered = tree.intersect(origins, directions, limits)
+    for name in ("t", "u", "v", "face"):
+        assert getattr(plain, name).numpy().tobytes() == getattr(ordered, name).numpy().tobytes()
+    assert (tree.occluded(origins, directions, limits).numpy() == occluded.numpy()).all()
+
+
 def test_equal_to_the_last_bit_for_any_thread_count():
     rng = np.random.default_rng(8)
     points, indices = soup(rng, 5000, 0.05)
@@ -360,7 +378,7 @@ def mesh_path(
     bvh: types.Bvh,
     origins: wp.array(dtype=wp.vec3),
     directions: wp.array(dtype=wp.vec3),
-    hits: queries.RayHits,
+    hits: bvh_rays.RayHits,
     occluded: wp.array(dtype=wp.int32),
 ):
     i = first + wp.tid()
@@ -384,7 +402,7 @@ def test_the_cuda_path_agrees_with_the_cpu_path(masked):
     origins, directions = rays(rng, 6000)
     mesh = bvh_module._make_mesh(wp.array(points, dtype=wp.vec3, device=CPU), indices, points)
     tree.data.mesh = mesh.id
-    hits = queries.RayHits()
+    hits = bvh_rays.RayHits()
     hits.t, hits.u, hits.v = (wp.zeros(6000, dtype=wp.float32, device=CPU) for _ in range(3))
     hits.face, occluded = wp.zeros(6000, dtype=wp.int32, device=CPU), wp.zeros(6000, dtype=wp.int32, device=CPU)
     arrays = [wp.array(a, dtype=wp.vec3, device=CPU) for a in (origins, directions)]
@@ -416,7 +434,7 @@ def test_cuda_equals_cpu():
 
 @pytest.mark.parametrize("arch", [80, 90])
 def test_compiles_for_cuda_without_a_gpu(arch, tmp_path):
-    module = wp.get_module("warp_gi.kernels.bvh")
+    module = wp.get_module("warp_gi.kernels.bvh_rays")
     written = wp.compile_aot_module(module, device=None, arch=arch, module_dir=tmp_path)
     assert any(path.suffix in (".cubin", ".ptx") and path.stat().st_size > 0 for path in written)
 

@@ -11,12 +11,16 @@ import warp as wp
 
 from warp_gi import launch
 from warp_gi.errors import SceneError
-from warp_gi.kernels import bvh as queries
 from warp_gi.kernels import bvh_build as building
+from warp_gi.kernels import bvh_native as layout
+from warp_gi.kernels import bvh_rays as batch
 from warp_gi.kernels import types
 
 SUBTREES = 64  # a build is shared out as about this many tasks
 MOST_TASKS = 1024
+ORDERED_RAYS = 1 << 15  # batches of fewer rays are traced as they come,
+ORDERED_OCCLUDED_BYTES = 1 << 25  # and so are those in trees of fewer bytes than this
+ORDERED_INTERSECT_BYTES = 1 << 23
 HUGE_PAGE = 1 << 21  # bytes
 
 
@@ -89,10 +93,10 @@ class TriangleBvh:
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes of the tree itself, without points, indices and textures."""
+        """Bytes of the tree itself, without vertices, indices and textures."""
         if self.device.is_cpu:
             return self.data.nodes.capacity + self.data.blocks.capacity
-        return 0 if self._mesh is None else 2 * 32 * self.triangle_count  # wp.Mesh: bounds and links, two nodes each
+        return 3 * 32 * self.triangle_count  # wp.Mesh: two binary nodes and the bounds of each triangle
 
     def refit(self, points: object) -> None:
         """Move the vertices; same shape and triangles. Queries slow down as motion departs from the built pose."""
@@ -111,31 +115,48 @@ class TriangleBvh:
         ``origins`` and ``directions`` are float32 [ray, 3], ``t_max`` a number or float32 [ray], in units of the
         direction's length. Raises SceneError on other shapes.
         """
-        rays = self._rays(origins, directions, t_max)
-        count = len(rays[0])
+        rays = self._rays(origins, directions, t_max, ORDERED_OCCLUDED_BYTES)
+        count = len(rays.origins)
         result = wp.empty(count, dtype=wp.uint8, device=self.device)
-        launch.launch(queries.occluded_rays, count, [self.data, *rays, result], self.device)
+        launch.launch(batch.occluded_rays, count, [self.data, rays, result], self.device)
         return result
 
     def intersect(self, origins: object, directions: object, t_max: object = np.inf) -> Hits:
         """Return the closest hits at 0 < t < t_max; arguments and errors as ``occluded``."""
-        rays = self._rays(origins, directions, t_max)
-        count = len(rays[0])
-        hits = queries.RayHits()
+        rays = self._rays(origins, directions, t_max, ORDERED_INTERSECT_BYTES)
+        count = len(rays.origins)
+        hits = batch.RayHits()
         hits.t, hits.u, hits.v = (wp.empty(count, dtype=wp.float32, device=self.device) for _ in range(3))
         hits.face = wp.empty(count, dtype=wp.int32, device=self.device)
-        launch.launch(queries.intersect_rays, count, [self.data, *rays, hits], self.device)
+        launch.launch(batch.intersect_rays, count, [self.data, rays, hits], self.device)
         return Hits(hits.t, hits.face, hits.u, hits.v)
 
-    def _rays(self, origins: object, directions: object, t_max: object) -> list[wp.array]:
-        rays = [_vectors(origins, "ray origins", self.device), _vectors(directions, "ray directions", self.device)]
-        if len(rays[0]) != len(rays[1]):
-            raise SceneError(f"expected as many ray directions as origins ({len(rays[0])}), got {len(rays[1])}")
+    def _rays(self, origins: object, directions: object, t_max: object, ordered_bytes: int) -> object:
+        rays = batch.RayBatch()
+        rays.origins = _vectors(origins, "ray origins", self.device)
+        rays.directions = _vectors(directions, "ray directions", self.device)
+        count = len(rays.origins)
+        if count != len(rays.directions):
+            raise SceneError(f"expected as many ray directions as origins ({count}), got {len(rays.directions)}")
         limits = t_max if isinstance(t_max, wp.array) else np.atleast_1d(_as_numpy(t_max)).astype(np.float32)
-        if limits.ndim != 1 or len(limits) not in (1, len(rays[0])):
-            raise SceneError(f"t_max must be a number or one for each of {len(rays[0])} rays, got shape {limits.shape}")
-        rays.append(wp.array(limits, dtype=wp.float32, device=self.device, copy=False))
+        if limits.ndim != 1 or len(limits) not in (1, count):
+            raise SceneError(f"t_max must be a number or one for each of {count} rays, got shape {limits.shape}")
+        rays.t_max = wp.array(limits, dtype=wp.float32, device=self.device, copy=False)
+        if self.device.is_cpu and count >= ORDERED_RAYS and self.memory_bytes >= ordered_bytes:
+            rays.order = self._order(rays.origins)
         return rays
+
+    def _order(self, origins: wp.array) -> wp.array | None:
+        """Return the rays' order along a Morton curve; None if neighbours mostly start in the same cell already."""
+        low, high = self._bounds
+        scale = 31.99 / max(float((high - low).max()), 1e-30)
+        sample = origins.numpy()[:: max(len(origins) // 2048, 2)], origins.numpy()[1 :: max(len(origins) // 2048, 2)]
+        cells = [np.nan_to_num((some[: len(sample[1])] - low) * scale).clip(0, 31).astype(np.int32) for some in sample]
+        if (cells[0] == cells[1]).all(axis=1).mean() > 0.5:
+            return None
+        keys = wp.empty(len(origins), dtype=wp.uint16, device=self.device)
+        launch.launch(batch.order_keys, len(origins), [origins, wp.vec3(*low.tolist()), scale, keys], self.device)
+        return wp.array(np.argsort(keys.numpy(), kind="stable"), dtype=wp.int64, device="cpu", copy=False)
 
     def _set_alpha(self, alpha: AlphaMasks) -> None:
         face_mask = np.ascontiguousarray(alpha.face_mask, dtype=np.int32)
@@ -174,21 +195,21 @@ class TriangleBvh:
         launch.launch(building.split_top, 1, [build, max(count // SUBTREES, 512)], device)
         launch.launch(building.build_subtrees, int(counts[0]), [build], device, smallest_slice=1)
         launch.launch(building.widen, 1, [build, None, None], device)
-        self.data.nodes = _empty(queries.NODE_WORDS * int(counts[2]), wp.uint32)
-        self.data.blocks = _empty(queries.BLOCK_WORDS * int(counts[3]), wp.float32)
+        self.data.nodes = _empty(layout.NODE_WORDS * int(counts[2]), wp.uint32)
+        self.data.blocks = _empty(layout.BLOCK_WORDS * int(counts[3]), wp.float32)
         launch.launch(building.widen, 1, [build, self.data.nodes, self.data.blocks], device)
         self._fill()
 
     def _fill(self) -> None:
-        blocks, nodes = self.data.blocks, self.data.nodes
-        launch.launch(
-            building.fill_blocks,
-            len(blocks) // queries.BLOCK_WORDS,
-            [self._positions, self._indices, self.data.face_masks, blocks],
-            self.device,
-        )
-        boxes = _empty(building.BOX_WORDS * (len(nodes) // queries.NODE_WORDS), wp.float32)
-        launch.launch(building.fill_nodes, 1, [nodes, blocks, boxes], self.device)
+        """Write the geometry of the tree from the vertices: all that a refit needs."""
+        points = self._positions.numpy()
+        self._bounds = points.min(axis=0), points.max(axis=0)
+        blocks, nodes, device = self.data.blocks, self.data.nodes, self.device
+        block_boxes = _empty(building.BOX_WORDS * (len(blocks) // layout.BLOCK_WORDS), wp.float32)
+        node_boxes = _empty(building.BOX_WORDS * (len(nodes) // layout.NODE_WORDS), wp.float32)
+        geometry = [self._positions, self._indices, self.data.face_masks]
+        launch.launch(building.fill_blocks, len(blocks) // layout.BLOCK_WORDS, [*geometry, blocks, block_boxes], device)
+        launch.launch(building.fill_nodes, 1, [nodes, block_boxes, node_boxes], device)
 
 
 def _make_mesh(points: wp.array, corners: np.ndarray, positions: np.ndarray) -> wp.Mesh:
@@ -255,6 +276,6 @@ def _checked_indices(indices: object) -> np.ndarray:
         raise SceneError(
             f"indices must be whole numbers of shape [triangle, 3], got {corners.dtype} {list(corners.shape)}"
         )
-    if len(corners) >= queries.FACE_MASKED:
-        raise SceneError(f"expected fewer than {queries.FACE_MASKED} triangles, got {len(corners)}")
+    if len(corners) >= layout.FACE_MASKED:
+        raise SceneError(f"expected fewer than {layout.FACE_MASKED} triangles, got {len(corners)}")
     return np.ascontiguousarray(corners.astype(np.int64))
