@@ -9,6 +9,7 @@ from warp_gi.kernels.types import (
     EMITTER_DIRECTIONAL,
     EMITTER_SPOT,
     EMITTER_TRIANGLE,
+    Emitters,
     SceneData,
 )
 
@@ -26,6 +27,22 @@ class LightSample:
     radiance: wp.vec3
     pdf: wp.float32
     delta: wp.int32
+
+
+# Whether a ray can meet an emissive triangle at all: whether it meets the box around them.
+@wp.func
+def may_hit_emitter(e: Emitters, origin: wp.vec3, direction: wp.vec3) -> wp.bool:
+    enter = float(0.0)
+    leave = float(wp.inf)
+    for axis in range(3):
+        d = direction[axis]
+        if wp.abs(d) < 1.0e-12:
+            d = 1.0e-12
+        a = (e.lower[axis] - origin[axis]) / d
+        b = (e.upper[axis] - origin[axis]) / d
+        enter = wp.max(enter, wp.min(a, b))
+        leave = wp.min(leave, wp.max(a, b))
+    return enter <= leave and e.lower[0] <= e.upper[0]
 
 
 # Solid-angle pdf of one strategy that picks this emissive triangle and a point uniform on it.

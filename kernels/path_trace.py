@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_gi.kernels.bsdf import bsdf_evaluate, bsdf_sample, bsdf_weight
 from warp_gi.kernels.bvh import BvhHit, bvh_intersect, bvh_occluded
-from warp_gi.kernels.emitters import sample_emitter, triangle_light_pdf
+from warp_gi.kernels.emitters import may_hit_emitter, sample_emitter, triangle_light_pdf
 from warp_gi.kernels.environment import (
     environment_lookup,
     environment_prefetch,
@@ -152,13 +152,15 @@ def trace_path(
         b = bsdf_sample(s.bsdf, wo, u_lobe, sample_2d(index, seed, d + 5))
         wi = s.shading * b.wi
         goes_on = b.pdf > 0.0 and wp.dot(wi, s.normal) > 0.0
-        if is_last and not sees_sky and not sees_emitters:
-            goes_on = False
         hit = BvhHit()
         hit.face = -1
         if goes_on:
             origin = ray_origin(s)
-            if is_last and not sees_emitters:
+            if is_last and sees_emitters:
+                sees_emitters = may_hit_emitter(scene.emitters, origin, wi)
+            if is_last and not sees_sky and not sees_emitters:
+                goes_on = False
+            elif is_last and not sees_emitters:
                 goes_on = not bvh_occluded(scene.bvh, origin, wi, float(wp.inf))
             else:
                 hit = bvh_intersect(scene.bvh, origin, wi, float(wp.inf))

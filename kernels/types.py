@@ -105,6 +105,8 @@ class Emitters:
     count: wp.int32
     emitters: wp.array(dtype=Emitter)  # [count] emissive triangles first, then punctual lights
     alias: wp.array(dtype=AliasBucket)  # [count] table of the current light sampler
+    lower: wp.vec3  # box around all emissive triangles; empty (lower > upper) if there are none
+    upper: wp.vec3
 
 
 # One way of cutting holes into triangles: a hit where the texture's bilinear

@@ -205,3 +205,22 @@ def test_variance_predicts_the_spread_over_seeds():
     measured = np.var([f.numpy("beauty") for f in images], axis=0, ddof=1).mean()
     predicted = np.mean([f.numpy("variance") for f in images])
     assert 0.3 * predicted < measured < 1.3 * predicted
+
+
+def test_a_lamp_that_moved_lights_like_one_that_stands_there():
+    """Its triangles, the box around emitters and the tree follow; nothing remembers where it was."""
+
+    def scene(lamp):
+        glow = gi.Material("lamp", emission=(3.0, 2.0, 1.0))
+        return gi.Scene([gi.Node("wall", [quad(-2.0, 5.0)]), gi.Node("card", [quad()]), lamp(quad(3.0, 0.5, glow))])
+
+    there = np.eye(4)
+    there[:3, 3] = (1.0, 2.0, 0.5)
+    still = scene(lambda mesh: gi.Node("lamp", [mesh], there))
+    moved = scene(lambda mesh: gi.Node("lamp", [mesh]))
+    moved.animate("lamp", [gi.Keyframe(0.0), gi.Keyframe(1.0, translation=(1.0, 2.0, 0.5))])
+    path, pipeline = gi.CameraPath.still(camera()), gi.Pipeline(spp=4)
+    at_rest, at_end = gi.render(moved, path, pipeline, frames=[0, 24])
+    expected = next(gi.render(still, path, pipeline, frames=[24]))
+    assert np.allclose(at_end.numpy("beauty"), expected.numpy("beauty"), rtol=1e-4, atol=1e-6)
+    assert not np.allclose(at_rest.numpy("beauty"), expected.numpy("beauty"), rtol=0.1)

@@ -284,6 +284,7 @@ class _DeviceScene:
         data.emitters.count = len(self.emitters)
         data.emitters.emitters = self._array(self.emitters, types.Emitter)
         data.emitters.alias = wp.empty(0, dtype=types.AliasBucket, device=device)
+        self._bound_emitters(data.emitters)
         low, high = scene.bounds
         data.center = wp.vec3(*(float(x) for x in (low.astype(np.float64) + high) / 2.0))
         data.radius = scene.radius
@@ -328,7 +329,18 @@ class _DeviceScene:
         self.world, self.previous_world = world, previous_world
         if moved:
             self.bvh.refit(flat.points)
+            self._bound_emitters(self.data.emitters)
         return moved or changed
+
+    def _bound_emitters(self, target: types.Emitters) -> None:
+        """Set the box around all emissive triangles, a little larger than they are."""
+        if len(self.scene._emissive) == 0:
+            target.lower, target.upper = wp.vec3(1.0, 1.0, 1.0), wp.vec3(-1.0, -1.0, -1.0)
+            return
+        corners = self.flat.points[self.flat.indices[self.scene._emissive]].reshape(-1, 3).astype(np.float64)
+        margin = 1e-4 * self.scene.radius
+        target.lower = wp.vec3(*(corners.min(axis=0) - margin))
+        target.upper = wp.vec3(*(corners.max(axis=0) + margin))
 
     def _upload(self, target: wp.array, source: np.ndarray, start: int, stop: int) -> None:
         """Copy items from ``start`` to ``stop``; on the CPU target and source are the same memory."""
