@@ -1,0 +1,304 @@
+"""Ray queries and tree builds beside Embree 4 (embreex) and Warp's own mesh queries.
+
+``python -m warp_gi.bench.rays [--quick] [--scenes NAME ...] [--json FILE]``. All get the same rays and triangles, as
+NumPy arrays, and one thread each; they take turns in one process and the median CPU time counts. "ours" is the batch
+call, which on large trees traces incoherent rays in Morton order and returns them in theirs; "ours in order" is what
+a query inside a kernel costs. Embree is as embreex makes it: not in robust mode, hence not watertight as ours is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_gi import bvh as bvh_module
+from warp_gi import launch
+from warp_gi.bench import presets, runner
+from warp_gi.bvh import TriangleBvh
+from warp_gi.errors import unknown_name
+
+Row = dict[str, Any]
+REPETITIONS = 5
+RAYS = 1_000_000
+QUICK_RAYS = 200_000
+QUICK_SCENES = ("living room", "sponza")
+NEVER = 1 << 62
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene file and the camera of its primary rays."""
+
+    file: str
+    eye: tuple[float, float, float]
+    target: tuple[float, float, float]
+    hfov: float
+
+
+CASES = {
+    "living room": Case("living_room/living_room.obj", (0.0, 1.0, 4.0), (0.5, 1.2, 0.0), 60.0),
+    "sponza": Case("crytek_sponza.glb", (-11.0, 1.5, -0.3), (5.0, 4.0, 0.0), 65.0),
+    "bistro": Case("bistro_exterior.glb", (-40.0, 45.0, -60.0), (-10.0, 0.0, -10.0), 60.0),
+    "dragon": Case("stanford_dragon.ply", (0.0, 0.15, 0.45), (0.0, 0.12, 0.0), 30.0),
+}
+
+
+def run(quick: bool = False, device: str = "cpu", scenes: Sequence[str] | None = None) -> list[Row]:
+    """Return a row for each scene's builds and one for each kind of ray and query.
+
+    ``quick`` takes two scenes and fewer rays. Scenes whose file is missing, and peers that are not installed, give
+    a row that says so. Raises OptionError for an unknown scene.
+    """
+    rows: list[Row] = []
+    for name in scenes or (QUICK_SCENES if quick else CASES):
+        if name not in CASES:
+            raise unknown_name("scene", name, CASES)
+        case = CASES[name]
+        if not (presets.SCENES / case.file).exists():
+            rows.append({"scene": name, "skipped": f"no {presets.SCENES / case.file}; set WARP_GI_SCENES"})
+            continue
+        points, indices = load_triangles(presets.SCENES / case.file)
+        count = QUICK_RAYS if quick else RAYS
+        batches = {"diffuse": diffuse_rays(points, indices, count), "primary": primary_rays(case, count)}
+        rows += compare(name, points, indices, batches, device, 3 if quick else REPETITIONS)
+    return rows
+
+
+def compare(
+    name: str,
+    points: np.ndarray,
+    indices: np.ndarray,
+    batches: dict[str, tuple[np.ndarray, np.ndarray]],
+    device: str = "cpu",
+    repetitions: int = REPETITIONS,
+) -> list[Row]:
+    """Return the rows of one mesh: float32 [vertex, 3] points, int32 [triangle, 3], batches of origins, directions."""
+    found = launch.get_device(device)
+    threads = launch.thread_count()
+    try:
+        launch.set_threads(1)
+        tree, embree, mesh, row = build_all(name, points, indices, device, repetitions)
+        rows = [row]
+        for kind, (origins, directions) in batches.items():
+            for query in ("any", "closest"):
+                row = {"scene": name, "triangles": len(indices), "rays": kind, "query": query}
+                row |= race(query, tree, embree, mesh, origins, directions, repetitions)
+                if found.is_cpu and threads > 1:
+                    row["2 threads"] = scaling(tree, query, origins, directions, repetitions)
+                rows.append(row)
+    finally:
+        launch.set_threads(None)
+    return rows
+
+
+def build_all(name: str, points: np.ndarray, indices: np.ndarray, device: str, repetitions: int) -> tuple:
+    """Return our tree, Embree's scene or None, a wp.Mesh, and the row of build times (CPU seconds)."""
+    TriangleBvh(points, indices[:100], device)  # compiles
+    row: Row = {"scene": name, "triangles": len(indices)}
+    builders: dict[str, Callable[[], object]] = {
+        "ours": lambda: TriangleBvh(points, indices, device),
+        "warp": lambda: warp_mesh(points, indices, device),
+    }
+    try:
+        from embreex import mesh_construction, rtcore_scene
+    except ImportError:
+        row["skipped"] = "embreex is not installed: pip install embreex"
+    else:
+
+        def embree() -> tuple:
+            scene = rtcore_scene.EmbreeScene()
+            mesh = mesh_construction.TriangleMesh(scene, points, indices)
+            scene.run(points[:1], points[:1] + 1.0, query="OCCLUDED")  # commits
+            return scene, mesh
+
+        builders["embree"] = embree
+    seconds, results = take_turns(builders, min(repetitions, 3))
+    for key, value in seconds.items():
+        row[f"{key} build s"] = value
+    if "embree" in seconds:
+        row["embree / ours"] = seconds["embree"] / seconds["ours"]
+    row["bytes a triangle"] = results["ours"].memory_bytes / len(indices)
+    return results["ours"], results.get("embree"), results["warp"], row
+
+
+def warp_mesh(points: np.ndarray, indices: np.ndarray, device: str) -> wp.Mesh:
+    """Return a wp.Mesh as fast as Warp makes it."""
+    options = {"bvh_constructor": "sah", "bvh_leaf_size": 4} if launch.get_device(device).is_cpu else {}
+    return wp.Mesh(
+        wp.array(points, dtype=wp.vec3, device=device),
+        wp.array(indices.ravel(), dtype=wp.int32, device=device),
+        **options,
+    )
+
+
+def race(
+    query: str,
+    tree: TriangleBvh,
+    embree: tuple | None,
+    mesh: wp.Mesh,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    repetitions: int,
+) -> Row:
+    """Return million rays a second of each contender and their ratios; agreement is of the hit or of the face."""
+    device = tree.device
+    runners: dict[str, Callable[[], np.ndarray]] = {"ours": lambda: trace(tree, query, origins, directions)}
+
+    def in_order() -> np.ndarray:
+        saved = bvh_module.ORDERED_RAYS
+        bvh_module.ORDERED_RAYS = NEVER
+        try:
+            return trace(tree, query, origins, directions)
+        finally:
+            bvh_module.ORDERED_RAYS = saved
+
+    runners["ours in order"] = in_order
+    if embree is not None:
+        name = "OCCLUDED" if query == "any" else "INTERSECT"
+        runners["embree"] = lambda: embree[0].run(origins, directions, query=name)
+
+    def warp_query() -> np.ndarray:
+        rays = [wp.array(x, dtype=wp.vec3, device=device, copy=False) for x in (origins, directions)]
+        faces = wp.empty(len(origins), dtype=wp.int32, device=device)
+        kernel = warp_any if query == "any" else warp_closest
+        launch.launch(kernel, len(origins), [mesh.id, *rays, faces], device)
+        return faces.numpy()
+
+    runners["warp"] = warp_query
+    seconds, results = take_turns(runners, repetitions)
+    row: Row = {f"{key} Mrays/s": len(origins) / value / 1e6 for key, value in seconds.items()}
+    if embree is not None:
+        row["ours / embree"] = seconds["embree"] / seconds["ours"]
+        row["in order / embree"] = seconds["embree"] / seconds["ours in order"]
+        found = results["embree"] == 0 if query == "any" else results["embree"]
+        row["agree"] = float((found == results["ours"]).mean())
+    row["ours / warp"] = seconds["warp"] / seconds["ours"]
+    row["in order / warp"] = seconds["warp"] / seconds["ours in order"]
+    return row
+
+
+def trace(tree: TriangleBvh, query: str, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return 0 or 1 (any) or the face (closest) for each ray."""
+    if query == "any":
+        return tree.occluded(origins, directions).numpy()
+    return tree.intersect(origins, directions).face.numpy()
+
+
+def take_turns(runners: dict[str, Callable[[], Any]], repetitions: int) -> tuple[dict[str, float], dict[str, Any]]:
+    """Return median CPU seconds and the last result of each."""
+    seconds: dict[str, list[float]] = {name: [] for name in runners}
+    results: dict[str, Any] = {}
+    for _ in range(repetitions):
+        for name, runner_ in runners.items():
+            results.pop(name, None)
+            started = time.process_time()
+            results[name] = runner_()
+            seconds[name].append(time.process_time() - started)
+    return {name: float(np.median(values)) for name, values in seconds.items()}, results
+
+
+def scaling(tree: TriangleBvh, query: str, origins: np.ndarray, directions: np.ndarray, repetitions: int) -> float:
+    """Return how many times faster (wall) two threads are than one: the best of each, as the machine may be shared."""
+    best = {1: np.inf, 2: np.inf}
+    for _ in range(repetitions):
+        for threads in best:
+            launch.set_threads(threads)
+            started = time.perf_counter()
+            trace(tree, query, origins, directions)
+            best[threads] = min(best[threads], time.perf_counter() - started)
+    launch.set_threads(1)
+    return best[1] / best[2]
+
+
+@wp.kernel(enable_backward=False)
+def warp_any(
+    first: wp.int32,
+    mesh: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.int32),
+):
+    i = first + wp.tid()
+    faces[i] = wp.int32(wp.mesh_query_ray_anyhit(mesh, origins[i], directions[i], wp.inf))
+
+
+@wp.kernel(enable_backward=False)
+def warp_closest(
+    first: wp.int32,
+    mesh: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.int32),
+):
+    i = first + wp.tid()
+    query = wp.mesh_query_ray(mesh, origins[i], directions[i], wp.inf)
+    faces[i] = wp.where(query.result, query.face, -1)
+
+
+def load_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return float32 [vertex, 3] points and int32 [triangle, 3] indices of a scene file."""
+    import trimesh
+
+    mesh = trimesh.load(path, force="mesh", process=False)
+    return np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.int32)
+
+
+def diffuse_rays(points: np.ndarray, indices: np.ndarray, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return cosine-distributed rays from points spread evenly over the surface, on either side, just off it."""
+    rng = np.random.default_rng(seed)
+    a, b, c = (points[indices[:, k]].astype(np.float64) for k in range(3))
+    normals = np.cross(b - a, c - a)
+    areas = np.linalg.norm(normals, axis=1)
+    face = np.searchsorted(np.cumsum(areas) / areas.sum(), rng.random(count)).clip(0, len(indices) - 1)
+    root, along = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
+    origins = (1.0 - root) * a[face] + root * (1.0 - along) * b[face] + root * along * c[face]
+    normal = normals[face] / areas[face, None] * rng.choice([-1.0, 1.0], (count, 1))
+    sphere = rng.normal(size=(count, 3))
+    directions = normal + sphere / np.linalg.norm(sphere, axis=1, keepdims=True)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    offset = 1e-5 * np.linalg.norm(points.max(axis=0) - points.min(axis=0))
+    return (origins + offset * normal).astype(np.float32), directions.astype(np.float32)
+
+
+def primary_rays(case: Case, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return about ``count`` camera rays through pixel centres of a 3:2 picture, row by row."""
+    height = round((count / 1.5) ** 0.5)
+    width = height * 3 // 2
+    right = np.tan(np.radians(case.hfov / 2.0))
+    x, y = np.meshgrid((np.arange(width) + 0.5) / width * 2 - 1, 1 - (np.arange(height) + 0.5) / height * 2)
+    forward = np.subtract(case.target, case.eye)
+    forward /= np.linalg.norm(forward)
+    side = np.cross(forward, (0.0, 1.0, 0.0))
+    side /= np.linalg.norm(side)
+    up = np.cross(side, forward)
+    directions = forward + x[..., None] * right * side + y[..., None] * right * height / width * up
+    directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).reshape(-1, 3).astype(np.float32)
+    return np.tile(np.float32(case.eye), (len(directions), 1)), directions
+
+
+def main() -> None:
+    """Print the rows as tables and as lines of JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="two scenes, fewer rays")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--scenes", nargs="+", choices=list(CASES), help="all by default")
+    parser.add_argument("--json", type=Path, help="also write the lines of JSON here")
+    options = parser.parse_args()
+    rows = run(options.quick, options.device, options.scenes)
+    runner.print_rows("rays", rows)
+    for row in rows:
+        print(json.dumps(row))
+    if options.json:
+        runner.write_json_lines(options.json, "rays", rows, options.quick, options.device)
+
+
+if __name__ == "__main__":
+    main()
