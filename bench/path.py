@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 import warp_gi as gi
-from warp_gi.bench import presets
+from warp_gi.bench import presets, runner
 from warp_gi.bench.mitsuba_peer import PeerMissing, load_mitsuba, to_mitsuba
 from warp_gi.metrics import RELATIVE_EPSILON
 
@@ -76,8 +76,8 @@ CASES = (
 
 
 def run(quick: bool = False, device: str = "cpu") -> list[Row]:
-    """Return a row of figures for each case, first frame and memory limit; ``quick`` takes a quarter of the pixels."""
-    rows = [compare(case, quick, device) for case in CASES]
+    """Return rows of figures for each case, first frame and memory limit; ``quick`` takes a quarter of the pixels."""
+    rows = [row for case in CASES for row in compare(case, quick, device)]
     return [*rows, *first_frames(device), *bistro_memory(device, quick)]
 
 
@@ -87,37 +87,38 @@ def pipeline(max_depth: int, spp: int) -> gi.Pipeline:
     return gi.Pipeline.preset("path", spp=spp, camera_samples=min(CAMERA_SAMPLES, spp), indirect=indirect)
 
 
-def compare(case: Case, quick: bool, device: str) -> Row:
-    """Return seconds and errors of both renderers for one case, at 64 samples a pixel."""
-    row: Row = {"case": case.name}
+def compare(case: Case, quick: bool, device: str) -> list[Row]:
+    """Return a row of seconds and a row of errors for one case, at 64 samples a pixel."""
     missing = [name for name in case.files if not (presets.SCENES / name).exists()]
     if missing:
-        return row | {"skipped": f"no {presets.SCENES / missing[0]}"}
+        return [{"case": case.name, "skipped": f"no {presets.SCENES / missing[0]}; set WARP_GI_SCENES"}]
     spp, size = 64, (240, 135) if quick else (480, 270)
     camera = case.camera.at_resolution(*size)
     scene = presets.peer_scene(case.scene(), diffuse=True, masks=False)
     scheduler = gi.FrameScheduler(scene, gi.CameraPath.still(camera), pipeline(case.max_depth, spp), device)
     renderers = {"ours": lambda i: scheduler.frame(i).numpy("beauty").copy()}
+    rows: list[Row] = []
     try:
         mi = load_mitsuba()
         peer, integrator = to_mitsuba(scene, camera), mi.load_dict(case.peer)
         renderers["mitsuba"] = lambda i: np.array(mi.render(peer, integrator=integrator, spp=spp, seed=i))
     except PeerMissing as missing_peer:
-        row["skipped"] = str(missing_peer)
+        rows.append({"case": case.name, "skipped": str(missing_peer)})
     times, images = measure(renderers)
     mean = np.mean([x for name in images for x in images[name]], axis=0)
-    row |= {"pixels": f"{size[0]}x{size[1]}", "spp": spp}
+    speed: Row = {"case": case.name, "pixels": f"{size[0]}x{size[1]}", "spp": spp}
+    error: Row = {"case": case.name}
     for name in renderers:
+        speed[f"{name} wall s"], speed[f"{name} cpu s"] = times[name]
         variance = np.var(images[name], axis=0, ddof=1)
-        row[f"{name} wall s"], row[f"{name} cpu s"] = times[name]
-        row[f"{name} relMSE"] = float(np.mean(variance / (mean**2 + RELATIVE_EPSILON)))
+        error[f"{name} relMSE"] = float(np.mean(variance / (mean**2 + RELATIVE_EPSILON)))
     if "mitsuba" in renderers:
-        row["faster (wall)"] = row["mitsuba wall s"] / row["ours wall s"]
-        row["faster (cpu)"] = row["mitsuba cpu s"] / row["ours cpu s"]
-        row["error ratio"] = row["ours relMSE"] / row["mitsuba relMSE"]
-        row["efficiency ratio"] = row["faster (cpu)"] / row["error ratio"]
-        row["means differ"] = float(np.mean(images["ours"]) / np.mean(images["mitsuba"]) - 1)
-    return row
+        speed["faster, wall"] = speed["mitsuba wall s"] / speed["ours wall s"]
+        speed["faster, cpu"] = speed["mitsuba cpu s"] / speed["ours cpu s"]
+        error["error ratio"] = error["ours relMSE"] / error["mitsuba relMSE"]
+        error["faster at equal error, cpu"] = speed["faster, cpu"] / error["error ratio"]
+        error["means differ"] = float(np.mean(images["ours"]) / np.mean(images["mitsuba"]) - 1)
+    return [*rows, speed, error]
 
 
 def measure(renderers: dict[str, Callable[[int], np.ndarray]]) -> tuple[dict[str, tuple[float, float]], dict[str, Any]]:
@@ -178,16 +179,17 @@ def _child(scene: str, size: tuple[int, int], spp: int, device: str, cache: str 
         return {"failed": (done.stderr.strip().splitlines() or ["no message"])[-1]}
     result = json.loads(done.stdout.strip().splitlines()[-1])
     finished = result.pop("finished")
-    return {"pixels": f"{size[0]}x{size[1]}", "spp": spp, "wall s": finished - started} | result
+    row = {"pixels": f"{size[0]}x{size[1]}", "spp": spp, "wall s": finished - started}
+    row["start s"] = finished - started - result["scene s"] - result["frame s"]
+    return row | result
 
 
 def _child_main(scene: str, width: str, height: str, spp: str, device: str) -> None:
-    started = time.time()
     import warp as wp
 
     wp.config.quiet = True
     wp.init()
-    imported = time.time()
+    started = time.time()
     views = {
         "crytek_sponza.glb": presets.SPONZA_VIEW,
         "bistro_exterior.glb": gi.Camera.look_at((-40, 45, -60), (-10, 0, -10)),
@@ -202,7 +204,7 @@ def _child_main(scene: str, width: str, height: str, spp: str, device: str) -> N
     frame = next(iter(gi.render(loaded, camera, gi.Pipeline.preset("path", spp=int(spp)), device=device)))
     frame.numpy("beauty")
     finished = time.time()
-    seconds = {"imports s": imported - started, "scene s": built - imported, "frame s": finished - built}
+    seconds = {"scene s": built - started, "frame s": finished - built}
     seconds |= {"compile s": frame.timings.get("compile", 0.0), "cpu s": time.process_time()}
     print(json.dumps({"finished": finished, **seconds, "peak GB": peak_memory() / 1e9}))
 
@@ -217,7 +219,7 @@ def peak_memory() -> float:
 
 
 def main() -> None:
-    """Print every row, as text and as a JSON line."""
+    """Print the rows, as tables and as lines of JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a quarter of the pixels")
     parser.add_argument("--device", default="cpu")
@@ -226,10 +228,9 @@ def main() -> None:
     if options.child:
         _child_main(*options.child)
         return
-    for row in run(options.quick, options.device):
-        figures = [f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items() if k != "case"]
-        print(f"{row['case']}: {', '.join(figures)}")
-        print(json.dumps(row), flush=True)
+    rows = run(options.quick, options.device)
+    runner.print_rows("path", rows)
+    print(runner.json_lines("path", rows, options.quick, options.device), end="")
 
 
 if __name__ == "__main__":
