@@ -3,7 +3,8 @@
 ``python -m warp_gi.bench.rays [--quick] [--scenes NAME ...] [--json FILE]``. All get the same rays and triangles, as
 NumPy arrays, and one thread each; they take turns in one process and the median CPU time counts. "ours" is the batch
 call, which on large trees traces incoherent rays in Morton order and returns them in theirs; "ours in order" is what
-a query inside a kernel costs. Embree is as embreex makes it: not in robust mode, hence not watertight as ours is.
+a query inside a kernel costs. "embree" is its fast mode, which may leak through edges; "embree robust", watertight
+like ours, is what embreex makes by default.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +33,7 @@ RAYS = 1_000_000
 QUICK_RAYS = 200_000
 QUICK_SCENES = ("living room", "sponza")
 NEVER = 1 << 62
+EMBREE = {"embree": False, "embree robust": True}
 
 
 @dataclass(frozen=True)
@@ -85,12 +88,12 @@ def compare(
     threads = launch.thread_count()
     try:
         launch.set_threads(1)
-        tree, embree, mesh, row = build_all(name, points, indices, device, repetitions)
+        tree, mesh, peers, row = build_all(name, points, indices, device, repetitions)
         rows = [row]
         for kind, (origins, directions) in batches.items():
             for query in ("any", "closest"):
                 row = {"scene": name, "triangles": len(indices), "rays": kind, "query": query}
-                row |= race(query, tree, embree, mesh, origins, directions, repetitions)
+                row |= race(query, tree, mesh, peers, origins, directions, repetitions)
                 if found.is_cpu and threads > 1:
                     row["2 threads"] = scaling(tree, query, origins, directions, repetitions)
                 rows.append(row)
@@ -100,7 +103,7 @@ def compare(
 
 
 def build_all(name: str, points: np.ndarray, indices: np.ndarray, device: str, repetitions: int) -> tuple:
-    """Return our tree, Embree's scene or None, a wp.Mesh, and the row of build times (CPU seconds)."""
+    """Return our tree, a wp.Mesh, Embree's scenes by name, and the row of build times (CPU seconds)."""
     TriangleBvh(points, indices[:100], device)  # compiles
     row: Row = {"scene": name, "triangles": len(indices)}
     builders: dict[str, Callable[[], object]] = {
@@ -113,20 +116,20 @@ def build_all(name: str, points: np.ndarray, indices: np.ndarray, device: str, r
         row["skipped"] = "embreex is not installed: pip install embreex"
     else:
 
-        def embree() -> tuple:
-            scene = rtcore_scene.EmbreeScene()
+        def embree(robust: bool) -> tuple:
+            scene = rtcore_scene.EmbreeScene(robust=robust)
             mesh = mesh_construction.TriangleMesh(scene, points, indices)
             scene.run(points[:1], points[:1] + 1.0, query="OCCLUDED")  # commits
             return scene, mesh
 
-        builders["embree"] = embree
+        builders |= {name: partial(embree, robust) for name, robust in EMBREE.items()}
     seconds, results = take_turns(builders, min(repetitions, 3))
     for key, value in seconds.items():
         row[f"{key} build s"] = value
-    if "embree" in seconds:
-        row["embree / ours"] = seconds["embree"] / seconds["ours"]
+    for key in [name for name in EMBREE if name in seconds]:
+        row[f"{key} / ours"] = seconds[key] / seconds["ours"]
     row["bytes a triangle"] = results["ours"].memory_bytes / len(indices)
-    return results["ours"], results.get("embree"), results["warp"], row
+    return results.pop("ours"), results.pop("warp"), results, row
 
 
 def warp_mesh(points: np.ndarray, indices: np.ndarray, device: str) -> wp.Mesh:
@@ -142,8 +145,8 @@ def warp_mesh(points: np.ndarray, indices: np.ndarray, device: str) -> wp.Mesh:
 def race(
     query: str,
     tree: TriangleBvh,
-    embree: tuple | None,
     mesh: wp.Mesh,
+    peers: dict[str, tuple],
     origins: np.ndarray,
     directions: np.ndarray,
     repetitions: int,
@@ -161,9 +164,9 @@ def race(
             bvh_module.ORDERED_RAYS = saved
 
     runners["ours in order"] = in_order
-    if embree is not None:
-        name = "OCCLUDED" if query == "any" else "INTERSECT"
-        runners["embree"] = lambda: embree[0].run(origins, directions, query=name)
+    name = "OCCLUDED" if query == "any" else "INTERSECT"
+    for key, (scene, _) in peers.items():
+        runners[key] = partial(scene.run, origins, directions, query=name)
 
     def warp_query() -> np.ndarray:
         rays = [wp.array(x, dtype=wp.vec3, device=device, copy=False) for x in (origins, directions)]
@@ -175,9 +178,10 @@ def race(
     runners["warp"] = warp_query
     seconds, results = take_turns(runners, repetitions)
     row: Row = {f"{key} Mrays/s": len(origins) / value / 1e6 for key, value in seconds.items()}
-    if embree is not None:
-        row["ours / embree"] = seconds["embree"] / seconds["ours"]
-        row["in order / embree"] = seconds["embree"] / seconds["ours in order"]
+    for key in peers:
+        row[f"ours / {key}"] = seconds[key] / seconds["ours"]
+        row[f"in order / {key}"] = seconds[key] / seconds["ours in order"]
+    if peers:
         found = results["embree"] == 0 if query == "any" else results["embree"]
         row["agree"] = float((found == results["ours"]).mean())
     row["ours / warp"] = seconds["warp"] / seconds["ours"]
@@ -193,16 +197,15 @@ def trace(tree: TriangleBvh, query: str, origins: np.ndarray, directions: np.nda
 
 
 def take_turns(runners: dict[str, Callable[[], Any]], repetitions: int) -> tuple[dict[str, float], dict[str, Any]]:
-    """Return median CPU seconds and the last result of each."""
+    """Return median CPU seconds and the first result of each."""
     seconds: dict[str, list[float]] = {name: [] for name in runners}
-    results: dict[str, Any] = {}
+    results: dict[str, list[Any]] = {name: [] for name in runners}
     for _ in range(repetitions):
         for name, runner_ in runners.items():
-            results.pop(name, None)
             started = time.process_time()
-            results[name] = runner_()
+            results[name].append(runner_())
             seconds[name].append(time.process_time() - started)
-    return {name: float(np.median(values)) for name, values in seconds.items()}, results
+    return {name: float(np.median(values)) for name, values in seconds.items()}, {k: v[0] for k, v in results.items()}
 
 
 def scaling(tree: TriangleBvh, query: str, origins: np.ndarray, directions: np.ndarray, repetitions: int) -> float:

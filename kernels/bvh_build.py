@@ -14,7 +14,7 @@ n references lies before its left subtree's 2 n_left - 1 nodes and those before 
 import warp as wp
 
 from warp_gi.kernels.bvh_build_native import BLOCK_COST, BUILD_SUBTREE, FILL_NODES, NODE_COST, SPLIT_TOP, WIDEN
-from warp_gi.kernels.bvh_native import BLOCK_WORDS, FACE_MASKED, NODE_WORDS, cpu_only
+from warp_gi.kernels.bvh_native import BLOCK_WORDS, FACE_MASKED, FACE_WORD, LANES, NODE_WORDS, cpu_only
 
 wp.set_module_options({"enable_backward": False})
 
@@ -160,8 +160,8 @@ def fill_blocks(
     start = block * BLOCK_WORDS
     low = wp.vec3(3.4e38)
     high = wp.vec3(-3.4e38)
-    for lane in range(4):
-        face = wp.cast(blocks[start + 36 + lane], wp.int32)
+    for lane in range(LANES):
+        face = wp.cast(blocks[start + FACE_WORD + lane], wp.int32)
         p0 = wp.vec3()
         p1 = wp.vec3()
         p2 = wp.vec3()
@@ -179,11 +179,11 @@ def fill_blocks(
             if face_masks.shape[0] > 0:
                 if face_masks[face] >= 0:
                     face = face | FACE_MASKED
-            blocks[start + 36 + lane] = wp.cast(face, wp.float32)
+            blocks[start + FACE_WORD + lane] = wp.cast(face, wp.float32)
         for k in range(3):
-            blocks[start + 4 * k + lane] = p0[k]
-            blocks[start + 12 + 4 * k + lane] = p1[k]
-            blocks[start + 24 + 4 * k + lane] = p2[k]
+            blocks[start + LANES * k + lane] = p0[k]
+            blocks[start + LANES * (3 + k) + lane] = p1[k]
+            blocks[start + LANES * (6 + k) + lane] = p2[k]
     for k in range(3):
         block_boxes[block * BOX_WORDS + k] = low[k]
         block_boxes[block * BOX_WORDS + 3 + k] = high[k]

@@ -1,7 +1,7 @@
 """Native code that builds the CPU's eight-wide tree; bvh_build.py describes the stages and the scratch arrays."""
 
 NODE_COST = 1.0  # visiting a node, relative to ...
-BLOCK_COST = 0.9  # ... testing a block of up to four triangles
+BLOCK_COST = 1.0  # ... testing a block of triangles
 
 
 BINARY = """
@@ -161,7 +161,7 @@ BINARY = """
                 costs[roots - 1] = best;  // that of 8 roots only until the surface takes its place
             }
             const int count = word(nodes[n].low);
-            const float block = count <= 4 ? area * BLOCK_COST : 3.4e38f, inner = area * NODE_COST + costs[7];
+            const float block = count <= LANES ? area * BLOCK_COST : 3.4e38f, inner = area * NODE_COST + costs[7];
             choice[0] = inner < block;
             costs[0] = inner < block ? inner : block;
             costs[7] = left[7] + right[7];
@@ -226,7 +226,7 @@ WIDEN = (
     Item stack[1024];
     int waiting = 0, wide_count = 1, block_count = 1;  // block 0 is empty
     stack[waiting++] = {0, 0};
-    if (!dry) for (int lane = 36; lane < BLOCK_WORDS; ++lane) ((int*)blocks.data)[lane] = -1;
+    if (!dry) for (int lane = FACE_WORD; lane < BLOCK_WORDS; ++lane) ((int*)blocks.data)[lane] = -1;
     while (waiting) {
         const Item item = stack[--waiting];
         int pending[8], budget[8], pending_count = 0, child_count = 0;
@@ -270,12 +270,12 @@ WIDEN = (
             }
             if (!dry) {
                 wide_node[48 + c] = ~(BLOCK_STEPS * block_count);
-                int* faces = (int*)blocks.data + BLOCK_WORDS * (long long)block_count + 36;
+                int* faces = (int*)blocks.data + BLOCK_WORDS * (long long)block_count + FACE_WORD;
                 int lanes = 0;
                 const int left = Builder::word(tree[n].high), last = left ? n + 2 * Builder::word(tree[n].low) - 2 : n;
                 for (int m = n; m <= last; ++m)
                     if (!Builder::word(tree[m].high)) faces[lanes++] = Builder::word(tree[m].low);
-                while (lanes < 4) faces[lanes++] = -1;
+                while (lanes < LANES) faces[lanes++] = -1;
             }
             ++block_count;
         }

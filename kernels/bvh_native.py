@@ -1,7 +1,7 @@
 """Native code of the CPU's ray queries (bvh.py): the alpha test, the traversals of the eight-wide tree.
 
 Node, 56 words: six rows of eight floats, the low x, y, z and high x, y, z of its children's boxes; eight children.
-Block, 40 words: nine rows of four floats, the x, y, z of vertices 0, 1, 2 of its triangles; four face words. A child
+Block, 80 words: nine rows of eight floats, the x, y, z of vertices 0, 1, 2 of its triangles; eight face words. A child
 is where a node starts or the complement of where a block starts, in steps of 32 bytes. Block 0 is empty and stands
 for no child. The triangle test is Woop, Benthin, Wald: "Watertight Ray/Triangle Intersection" (JCGT 2013), so no ray
 slips through an edge or vertex that triangles share.
@@ -9,25 +9,28 @@ slips through an edge or vertex that triangles share.
 
 STEP_WORDS = 8  # 32 bytes
 NODE_STEPS = 7
-BLOCK_STEPS = 5
+BLOCK_STEPS = 10
 NODE_WORDS = NODE_STEPS * STEP_WORDS
 BLOCK_WORDS = BLOCK_STEPS * STEP_WORDS
+LANES = 8  # triangles in a block
+FACE_WORD = 9 * LANES  # of a block, the first
 FACE_MASKED = 1 << 30  # flag in a face word; -1 marks an empty lane
 STACK_SIZE = 512  # 7 for each level of a tree that is at most 70 deep
+LAYOUT = {
+    "NODE_STEPS": NODE_STEPS,
+    "BLOCK_STEPS": BLOCK_STEPS,
+    "NODE_WORDS": NODE_WORDS,
+    "BLOCK_WORDS": BLOCK_WORDS,
+    "LANES": LANES,
+    "FACE_WORD": FACE_WORD,
+    "FACE_MASKED": FACE_MASKED,
+    "STACK_SIZE": STACK_SIZE,
+}
 
 
 def cpu_only(snippet: str, otherwise: str = "", **constants: float) -> str:
     """Return the snippet with named constants filled in; CUDA, without clang's vector types, sees ``otherwise``."""
-    constants |= {
-        "NODE_STEPS": NODE_STEPS,
-        "BLOCK_STEPS": BLOCK_STEPS,
-        "NODE_WORDS": NODE_WORDS,
-    }
-    constants |= {
-        "BLOCK_WORDS": BLOCK_WORDS,
-        "FACE_MASKED": FACE_MASKED,
-        "STACK_SIZE": STACK_SIZE,
-    }
+    constants = {**LAYOUT, **constants}
     for name, value in constants.items():
         snippet = snippet.replace(name, repr(value) + ("f" if isinstance(value, float) else ""))
     return f"#if !defined(__CUDA_ARCH__)\n{snippet}\n#else\n{otherwise}\n#endif\n;"
@@ -75,13 +78,12 @@ TRANSPARENT = """
 # Ray set-up, box test and triangle test, then the start of the query's struct. Rounding: boxes are enlarged when
 # they are filled in, the ray's far side moves out and its near side in by a bound on the error of
 # slope * plane + offset, so a box never loses a ray that its triangles would keep. Vectors of 256 bits: on the
-# machine this was tuned on, 512-bit ones ran at half the speed, and so did boxes of 8-bit integers.
+# machine this was tuned on 512-bit ones ran at half the speed, and boxes of 8-bit integers lost a tenth to a fifth.
 TRAVERSAL = (
     """
     typedef float f4 __attribute__((vector_size(16)));
     typedef float f8 __attribute__((vector_size(32)));
-    typedef int i4 __attribute__((vector_size(16)));
-    typedef bool b4 __attribute__((ext_vector_type(4)));
+    typedef int i8 __attribute__((vector_size(32)));
     typedef bool b8 __attribute__((ext_vector_type(8)));
     typedef unsigned long long Entry;  // entry distance in the high half, child in the low half
 
@@ -121,7 +123,7 @@ TRAVERSAL = (
                 far_row[axis] = 32 * axis + (d[axis] < 0.0f ? 0 : 96);
             }
             const int i = k == 2 ? 0 : k + 1, j = k == 0 ? 2 : k - 1;
-            kx = 4 * i, ky = 4 * j, kz = 4 * k;
+            kx = 8 * i, ky = 8 * j, kz = 8 * k;
             origin_x = start[i], origin_y = start[j], origin_z = start[k];
             inverse_z = inverse[k];
             const f4 shear = d / d[k];
@@ -142,31 +144,31 @@ TRAVERSAL = (
             return __builtin_bit_cast(unsigned char, __builtin_convertvector(entry <= leave, b8));
         }
 
-        static inline f4 edge(f4 ax, f4 by, f4 ay, f4 bx) {
+        static inline f8 edge(f8 ax, f8 by, f8 ay, f8 bx) {
 #pragma clang fp contract(off)
             return ax * by - ay * bx;  // exactly antisymmetric, so both sides of a shared edge agree
         }
 
-        static inline unsigned bits(i4 mask) {
-            return __builtin_bit_cast(unsigned char, __builtin_convertvector(mask, b4)) & 15u;
+        static inline unsigned bits(i8 mask) {
+            return __builtin_bit_cast(unsigned char, __builtin_convertvector(mask, b8));
         }
 
         // Bits of the triangles hit with 0 < t < limit, their t and barycentrics of vertex 1 and 2.
-        inline unsigned triangles(const float* block, float limit, f4& t, f4& u, f4& v) const {
+        inline unsigned triangles(const float* block, float limit, f8& t, f8& u, f8& v) const {
 #pragma clang fp contract(fast)
-            const f4 az = *(const f4*)(block + kz) - origin_z;
-            const f4 bz = *(const f4*)(block + 12 + kz) - origin_z;
-            const f4 cz = *(const f4*)(block + 24 + kz) - origin_z;
-            const f4 ax = (*(const f4*)(block + kx) - origin_x) - shear_x * az;
-            const f4 ay = (*(const f4*)(block + ky) - origin_y) - shear_y * az;
-            const f4 bx = (*(const f4*)(block + 12 + kx) - origin_x) - shear_x * bz;
-            const f4 by = (*(const f4*)(block + 12 + ky) - origin_y) - shear_y * bz;
-            const f4 cx = (*(const f4*)(block + 24 + kx) - origin_x) - shear_x * cz;
-            const f4 cy = (*(const f4*)(block + 24 + ky) - origin_y) - shear_y * cz;
-            const f4 wa = edge(cx, by, cy, bx), wb = edge(ax, cy, ay, cx), wc = edge(bx, ay, by, ax);
-            const i4 inside = (low(low(wa, wb), wc) >= 0.0f) | (high(high(wa, wb), wc) <= 0.0f);
+            const f8 az = *(const f8*)(block + kz) - origin_z;
+            const f8 bz = *(const f8*)(block + 24 + kz) - origin_z;
+            const f8 cz = *(const f8*)(block + 48 + kz) - origin_z;
+            const f8 ax = (*(const f8*)(block + kx) - origin_x) - shear_x * az;
+            const f8 ay = (*(const f8*)(block + ky) - origin_y) - shear_y * az;
+            const f8 bx = (*(const f8*)(block + 24 + kx) - origin_x) - shear_x * bz;
+            const f8 by = (*(const f8*)(block + 24 + ky) - origin_y) - shear_y * bz;
+            const f8 cx = (*(const f8*)(block + 48 + kx) - origin_x) - shear_x * cz;
+            const f8 cy = (*(const f8*)(block + 48 + ky) - origin_y) - shear_y * cz;
+            const f8 wa = edge(cx, by, cy, bx), wb = edge(ax, cy, ay, cx), wc = edge(bx, ay, by, ax);
+            const i8 inside = (low(low(wa, wb), wc) >= 0.0f) | (high(high(wa, wb), wc) <= 0.0f);
             if (!bits(inside)) return 0;
-            const f4 inverse = 1.0f / (wa + wb + wc);  // infinite where edge-on: then t is infinite or NaN, no hit
+            const f8 inverse = 1.0f / (wa + wb + wc);  // infinite where edge-on: then t is infinite or NaN, no hit
             t = (wa * az + wb * bz + wc * cz) * inverse * inverse_z;
             u = wb * inverse;
             v = wc * inverse;
@@ -186,6 +188,10 @@ TRAVERSAL = (
         __attribute__((noinline, cold, preserve_all)) bool transparent(int face, float u, float v) const {%s}
         inline bool passes(int face, float u, float v) const {
             return __builtin_expect(face & FACE_MASKED, 0) && transparent(face & ~FACE_MASKED, u, v);
+        }
+        inline void prefetch(int child) const {
+            const char* at = child >= 0 ? node_at(child) : (const char*)block_at(child);
+            for (int line = 0; line < 3; ++line) __builtin_prefetch(at + 64 * line);
         }
         inline const char* node_at(int child) const { return nodes + ((long long)child << 5); }
         inline const float* block_at(int child) const { return (const float*)(blocks + ((long long)~child << 5)); }
@@ -230,11 +236,11 @@ OCCLUDED = (
                     }
                 } else {
                     const float* block = block_at(child);
-                    f4 t, u, v;
+                    f8 t, u, v;
                     unsigned hits = ray.triangles(block, limit, t, u, v);
                     while (hits) {
                         const int lane = __builtin_ctz(hits);
-                        if (!passes(((const int*)block)[36 + lane], u[lane], v[lane])) return 1;
+                        if (!passes(((const int*)block)[FACE_WORD + lane], u[lane], v[lane])) return 1;
                         hits &= hits - 1;
                     }
                 }
@@ -278,6 +284,7 @@ INTERSECT = (
                         const int first = size;
                         stack[size++] = a < b ? b : a;
                         Entry nearest = a < b ? a : b;
+                        prefetch((int)(unsigned)stack[size - 1]);
                         while (hits) {
                             i = __builtin_ctz(hits);
                             hits &= hits - 1;
@@ -292,12 +299,12 @@ INTERSECT = (
                     }
                 } else {
                     const float* block = block_at(child);
-                    f4 t, u, v;
+                    f8 t, u, v;
                     unsigned hits = ray.triangles(block, limit, t, u, v);
                     while (hits) {
                         const int lane = __builtin_ctz(hits);
                         hits &= hits - 1;
-                        const int face = ((const int*)block)[36 + lane];
+                        const int face = ((const int*)block)[FACE_WORD + lane];
                         if (t[lane] >= limit || passes(face, u[lane], v[lane])) continue;
                         limit = t[lane];
                         const int plain_face = face & ~FACE_MASKED;
