@@ -95,7 +95,7 @@ def compare(
                 row = {"scene": name, "triangles": len(indices), "rays": kind, "query": query}
                 row |= race(query, tree, mesh, peers, origins, directions, repetitions)
                 if found.is_cpu and threads > 1:
-                    row["2 threads"] = scaling(tree, query, origins, directions, repetitions)
+                    row |= scaling(tree, query, origins, directions, repetitions)
                 rows.append(row)
     finally:
         launch.set_threads(None)
@@ -208,17 +208,18 @@ def take_turns(runners: dict[str, Callable[[], Any]], repetitions: int) -> tuple
     return {name: float(np.median(values)) for name, values in seconds.items()}, {k: v[0] for k, v in results.items()}
 
 
-def scaling(tree: TriangleBvh, query: str, origins: np.ndarray, directions: np.ndarray, repetitions: int) -> float:
-    """Return how many times faster (wall) two threads are than one: the best of each, as the machine may be shared."""
-    best = {1: np.inf, 2: np.inf}
+def scaling(tree: TriangleBvh, query: str, origins: np.ndarray, directions: np.ndarray, repetitions: int) -> Row:
+    """Return what two threads do to wall time (the best of each, as the machine may be shared) and to CPU time."""
+    best = {1: (np.inf, np.inf), 2: (np.inf, np.inf)}
     for _ in range(repetitions):
         for threads in best:
             launch.set_threads(threads)
-            started = time.perf_counter()
+            wall, cpu = time.perf_counter(), time.process_time()
             trace(tree, query, origins, directions)
-            best[threads] = min(best[threads], time.perf_counter() - started)
+            taken = time.perf_counter() - wall, time.process_time() - cpu
+            best[threads] = tuple(np.minimum(best[threads], taken).tolist())
     launch.set_threads(1)
-    return best[1] / best[2]
+    return {"2 threads faster": best[1][0] / best[2][0], "2 threads cpu": best[2][1] / best[1][1]}
 
 
 @wp.kernel(enable_backward=False)
