@@ -101,6 +101,22 @@ def emitter_light(
     return wp.cw_mul(f.value, e.radiance) / (e.pdf * share + f.pdf)
 
 
+# Numbers for light samples: stratified where the camera looks, merely random further along a path,
+# where directions that scatter leave little of a stratification to keep.
+@wp.func
+def light_1d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32, at_first: wp.bool) -> wp.float32:
+    if at_first:
+        return sample_1d(index, seed, dimension)
+    return random_1d(index, seed, dimension + 4096)
+
+
+@wp.func
+def light_2d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32, at_first: wp.bool) -> wp.vec2:
+    if at_first:
+        return sample_2d(index, seed, dimension)
+    return wp.vec2(random_1d(index, seed, dimension + 4096), random_1d(index, seed, dimension + 8192))
+
+
 # Follows one path from the first hit `surface`, seen from direction `towards_camera`.
 @wp.func
 def trace_path(
@@ -122,7 +138,7 @@ def trace_path(
         wants_emitter = scene.emitters.count > 0
         u_select = wp.vec2(0.0, 0.0)
         if wants_emitter:
-            u_select = wp.vec2(sample_1d(index, seed, d), random_1d(index, seed, d))
+            u_select = wp.vec2(light_1d(index, seed, d, at_first), random_1d(index, seed, d))
         if at_first:
             sky_share = 1.0
             emitter_share = 1.0
@@ -135,7 +151,7 @@ def trace_path(
             u_select = wp.vec2((u_select[0] - sky_share) / emitter_share, u_select[1])
         u_sky = wp.vec3(0.0, 0.0, 0.0)
         if wants_sky:
-            u2 = sample_2d(index, seed, d + 1)
+            u2 = light_2d(index, seed, d + 1, at_first)
             u_sky = wp.vec3(u2[0], u2[1], random_1d(index, seed, d + 2))
             environment_prefetch(scene.environment, u_sky)
 
@@ -177,7 +193,7 @@ def trace_path(
             else:
                 r.indirect = r.indirect + wp.cw_mul(throughput, light)
         if wants_emitter:
-            light = emitter_light(scene, s, wo, u_select, sample_2d(index, seed, d + 3), emitter_share)
+            light = emitter_light(scene, s, wo, u_select, light_2d(index, seed, d + 3, at_first), emitter_share)
             if at_first:
                 r.emitters = light
             else:
