@@ -16,38 +16,38 @@ LARGEST_FLOAT_BELOW_ONE = wp.constant(wp.float32(0.99999994))
 class AliasChoice:
     item: wp.int32
     pdf: wp.float32  # probability of selecting it
-    remainder: wp.float32  # what is left of the random number: uniform in [0, 1), free for another use
+    remainder: wp.float32  # what is left of the random numbers: uniform in [0, 1), free for another use
 
 
-# Bucket and side from two uniform numbers in [0, 1): exact for tables of any size,
-# because float32 keeps no bits of u once it has picked one of many buckets. The remainder is v's.
+# Where two uniform numbers in [0, 1) fall among `count` buckets: the whole part is the bucket, the rest uniform
+# in it. A float32 holds 24 bits, too few for a table of millions, so the digits of v follow those of u.
+@wp.func
+def alias_position(count: wp.int32, u: wp.float32, v: wp.float32) -> wp.float64:
+    return (wp.float64(u) + wp.float64(v) * wp.float64(5.9604644775390625e-8)) * wp.float64(count)
+
+
+# An item from two uniform numbers in [0, 1): u decides, as stratified as it is, and v adds digits (alias_position).
 @wp.func
 def alias_choice(buckets: wp.array(dtype=AliasBucket), count: wp.int32, u: wp.float32, v: wp.float32) -> AliasChoice:
-    item = wp.min(wp.int32(u * wp.float32(count)), count - 1)
+    position = alias_position(count, u, v)
+    item = wp.min(wp.int32(position), count - 1)
+    rest = wp.min(wp.float32(position - wp.float64(item)), LARGEST_FLOAT_BELOW_ONE)
     bucket = buckets[item]
     keep = bucket.probability
     choice = AliasChoice()
-    if v < keep:
+    if rest < keep:
         choice.item = item
         choice.pdf = bucket.pdf
-        choice.remainder = v / keep
+        choice.remainder = rest / keep
     else:
         choice.item = bucket.index
         choice.pdf = bucket.index_pdf
-        choice.remainder = (v - keep) / (1.0 - keep)
+        choice.remainder = (rest - keep) / (1.0 - keep)
     choice.remainder = wp.min(choice.remainder, LARGEST_FLOAT_BELOW_ONE)
     return choice
 
 
-# The same from one number, which keeps its stratification. Of u's 24 bits, log2(count) pick the
-# bucket: for tables of up to a few thousand items.
-@wp.func
-def alias_choice_small(buckets: wp.array(dtype=AliasBucket), count: wp.int32, u: wp.float32) -> AliasChoice:
-    scaled = u * wp.float32(count)
-    return alias_choice(buckets, count, u, scaled - wp.floor(scaled))
-
-
-# Starts fetching the bucket that alias_choice will read for u.
+# Starts fetching the bucket that alias_choice will read for u (or, in tables of millions, its neighbour).
 @wp.func_native(
     snippet="""
 #if !defined(__CUDA_ARCH__)

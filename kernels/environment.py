@@ -130,7 +130,7 @@ def environment_lookup(env: Environment, direction: wp.vec3) -> EnvironmentLooku
 
 # A direction with a density close to the radiance from there (not looked up: most samples turn out to
 # be occluded, and each lookup in a map waits for memory), from three uniform numbers in [0, 1):
-# u[0] picks a bucket of the alias table, u[2] its side and then the azimuth, u[1] the polar angle.
+# u[0] with further digits u[2] picks a cell and then the azimuth in it, u[1] the polar angle.
 @wp.func
 def environment_sample(env: Environment, u: wp.vec3) -> EnvironmentSample:
     result = EnvironmentSample()

@@ -11,7 +11,7 @@ from statistics_tools import chi_squared
 from warp_gi import launch
 from warp_gi.alias import AliasTable
 from warp_gi.errors import OptionError, SceneError
-from warp_gi.kernels.alias import alias_choice, alias_choice_small
+from warp_gi.kernels.alias import alias_choice, alias_position
 from warp_gi.kernels.environment import (
     environment_lookup,
     environment_pdf,
@@ -69,19 +69,21 @@ def choose(
     first: wp.int32,
     buckets: wp.array(dtype=AliasBucket),
     numbers: wp.array(dtype=wp.vec2),
-    items: wp.array2d(dtype=wp.int32),
-    remainders: wp.array2d(dtype=wp.float32),
-    pdfs: wp.array2d(dtype=wp.float32),
+    items: wp.array(dtype=wp.int32),
+    remainders: wp.array(dtype=wp.float32),
+    pdfs: wp.array(dtype=wp.float32),
 ):
     i = first + wp.tid()
-    a = alias_choice(buckets, buckets.shape[0], numbers[i][0], numbers[i][1])
-    b = alias_choice_small(buckets, buckets.shape[0], numbers[i][0])
-    items[i, 0] = a.item
-    items[i, 1] = b.item
-    remainders[i, 0] = a.remainder
-    remainders[i, 1] = b.remainder
-    pdfs[i, 0] = a.pdf
-    pdfs[i, 1] = b.pdf
+    choice = alias_choice(buckets, buckets.shape[0], numbers[i][0], numbers[i][1])
+    items[i] = choice.item
+    remainders[i] = choice.remainder
+    pdfs[i] = choice.pdf
+
+
+@wp.kernel
+def place(first: wp.int32, count: wp.int32, numbers: wp.array(dtype=wp.vec2), positions: wp.array(dtype=wp.float64)):
+    i = first + wp.tid()
+    positions[i] = alias_position(count, numbers[i][0], numbers[i][1])
 
 
 def evaluate(env: Environment, directions: np.ndarray, device: str = "cpu") -> tuple[np.ndarray, np.ndarray]:
@@ -155,20 +157,31 @@ def test_alias_table_is_sampled_as_its_pdf_says(count):
     table = AliasTable.build(weights)
     assert np.allclose(table.pdf, weights / weights.sum(), atol=1e-6 / count)
     numbers = rng.random((200_000, 2), dtype=np.float32)
-    items = wp.zeros((len(numbers), 2), dtype=wp.int32, device="cpu")
-    remainders = wp.zeros((len(numbers), 2), dtype=wp.float32, device="cpu")
-    pdfs = wp.zeros((len(numbers), 2), dtype=wp.float32, device="cpu")
+    items = wp.zeros(len(numbers), dtype=wp.int32, device="cpu")
+    remainders = wp.zeros(len(numbers), dtype=wp.float32, device="cpu")
+    pdfs = wp.zeros(len(numbers), dtype=wp.float32, device="cpu")
     cpu = wp.get_device("cpu")
     inputs = [table.on(cpu), wp.array(numbers, dtype=wp.vec2, device="cpu"), items, remainders, pdfs]
-    launch.launch(choose, len(numbers), inputs, wp.get_device("cpu"))
-    for chosen, rest in zip(items.numpy().T, remainders.numpy().T, strict=True):
-        counts = np.bincount(chosen, minlength=count)
-        assert (counts[weights == 0] == 0).all()
-        assert chi_squared(counts, len(numbers) * table.pdf.astype(np.float64)) > 1e-4
-        assert np.array_equal(pdfs.numpy()[:, 0], table.pdf[items.numpy()[:, 0]])
-        assert np.array_equal(pdfs.numpy()[:, 1], table.pdf[items.numpy()[:, 1]])
-        assert rest.min() >= 0 and rest.max() < 1
-        assert chi_squared(np.histogram(rest, 50, (0, 1))[0], np.full(50, len(numbers) / 50)) > 1e-4
+    launch.launch(choose, len(numbers), inputs, cpu)
+    chosen, rest = items.numpy(), remainders.numpy()
+    counts = np.bincount(chosen, minlength=count)
+    assert (counts[weights == 0] == 0).all()
+    assert chi_squared(counts, len(numbers) * table.pdf.astype(np.float64)) > 1e-4
+    assert np.array_equal(pdfs.numpy(), table.pdf[chosen])
+    assert rest.min() >= 0 and rest.max() < 1
+    assert chi_squared(np.histogram(rest, 50, (0, 1))[0], np.full(50, len(numbers) / 50)) > 1e-4
+
+
+def test_alias_table_of_a_large_sky_reaches_every_bucket():
+    count = 8192 * 4096  # more than float32 tells apart
+    numbers = np.random.default_rng(3).random((100_000, 2), dtype=np.float32)
+    positions = wp.zeros(len(numbers), dtype=wp.float64, device="cpu")
+    inputs = [count, wp.array(numbers, dtype=wp.vec2, device="cpu"), positions]
+    launch.launch(place, len(numbers), inputs, wp.get_device("cpu"))
+    buckets = positions.numpy().astype(np.int64)
+    assert buckets.min() >= 0 and buckets.max() < count
+    assert chi_squared(np.bincount(buckets % 8, minlength=8), np.full(8, len(numbers) / 8)) > 1e-4
+    assert chi_squared(np.histogram(positions.numpy() % 1, 50, (0, 1))[0], np.full(50, len(numbers) / 50)) > 1e-4
 
 
 def test_alias_table_refuses_bad_weights():

@@ -33,7 +33,7 @@ from warp_gi.scene.sky import SunSky, node_solid_angles
 __all__ = ["Environment", "SunSky", "as_environment"]
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-LARGEST_HEIGHT = 4096  # texel indices and the random number that picks one must fit float32
+LARGEST_HEIGHT = 4096  # texel coordinates must be exact in float32 with bits left to interpolate
 NEGLIGIBLE_NEGATIVE = 1e-4  # of the sum of all pixels
 
 
