@@ -209,10 +209,12 @@ def surface_shape(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32
     normal = wp.normalize(wp.cross(p1 - p0, p2 - p0))
     shading = g.normals[ids[0]] * w + g.normals[ids[1]] * u + g.normals[ids[2]] * v
     length = wp.length(shading)
-    if length > 1.0e-6:
-        shading = shading / length
-    else:
+    if length <= 1.0e-6:
         shading = normal
+    elif wp.dot(shading, normal) >= 0.0:
+        shading = shading / length
+    else:  # files whose normals point to the back of their triangles
+        shading = shading / -length
     if m.normal_texture >= 0:
         shading = mapped_normal(scene, m.normal_texture, m.normal_scale, face, s.uv, shading)
     if wp.dot(normal, wo) < 0.0:

@@ -43,10 +43,10 @@ def evaluate_circle(first: wp.int32, u: wp.array(dtype=wp.float32), points: wp.a
     points[i] = sampling.circle(u[i])
 
 
-def samples(width=8, height=8, spp=4, seed=1, dimension=3):
+def samples(width=8, height=8, spp=4, seed=1, dimension=3, bits=None):
     points = wp.zeros(width * height * spp, dtype=wp.vec2, device=CPU)
     singles = wp.zeros(width * height * spp, dtype=wp.float32, device=CPU)
-    bits = (spp - 1).bit_length()
+    bits = (spp - 1).bit_length() if bits is None else bits
     launch(draw_pairs, len(points), [width, spp, bits, seed, dimension, points, singles], CPU)
     return points.numpy().reshape(height, width, spp, 2), singles.numpy().reshape(height, width, spp)
 
@@ -88,6 +88,8 @@ def test_seeds_dimensions_and_far_pixels_are_independent():
         assert abs(correlation) < 0.25  # 256 pairs: four standard deviations
     again, _ = samples(seed=1, dimension=3)
     assert (a == again).all()
+    far, _ = samples(bits=28)  # of 32: pixels 4 apart share their place in the sequence
+    assert (far[:4, :4] != far[4:, :4]).any(axis=-1).all() and (far[:4, :4] != far[:4, 4:]).any(axis=-1).all()
 
 
 def test_error_is_blue_over_the_picture():

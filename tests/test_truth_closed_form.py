@@ -172,11 +172,34 @@ def test_punctual_lights():
         (gi.PunctualLight("directional", (3.0, 2.0, 1.0), direction=(0, -1, 1)), np.sqrt(0.5)),
         (gi.PunctualLight("spot", (3.0, 2.0, 1.0), position=(0, 1, 0), direction=down), 1.0),
         (gi.PunctualLight("spot", (3.0, 2.0, 1.0), position=(0, 1, 0), direction=(0, 1, 0)), 0.0),
+        (  # the origin is 0.3 rad off the axis, between the cones
+            gi.PunctualLight(
+                "spot", (3.0, 2.0, 1.0), (0, 1, 0), (np.sin(0.3), -np.cos(0.3), 0), inner_cone=0.1, outer_cone=0.6
+            ),
+            ((np.cos(0.3) - np.cos(0.6)) / (np.cos(0.1) - np.cos(0.6))) ** 2,
+        ),
     ]
     for punctual, strength in cases:
         image = st.renderings(scene_of(ground(), lights=(punctual,)), spot_camera(), path(4), 1)[0]
         expected = ALBEDO / np.pi * [3.0, 2.0, 1.0] * strength
-        assert np.allclose(image, expected, rtol=5e-3), f"{punctual}: {image[0, 0]}, expected {expected}"
+        assert np.allclose(image, expected, rtol=1e-2), f"{punctual}: {image[0, 0]}, expected {expected}"
+
+
+def test_bounced_light_of_sky_and_punctual_lights_adds_up():
+    """After the first bounce a vertex samples the sky or a light: each must make up for the turns of the other."""
+    wall = quad((-2, 0, -1), (4, 0, 0), (0, 2, 0), GROUND, "wall")
+    sky = gi.Environment(pixels=np.random.default_rng(4).random((8, 16, 3)).astype(np.float32) ** 4)
+    lights = tuple(gi.PunctualLight("point", (1.5, 1.0, 0.5), position=(x, 1.0, 0.5)) for x in (-0.7, 0.9))
+    camera = gi.Camera.look_at((0, 1, 3), (0, 0.5, 0), hfov=50, resolution=(12, 8))
+
+    def indirect(seed: int, **settings: object) -> np.ndarray:
+        scene = scene_of(ground(), wall, **settings)
+        return st.renderings(scene, camera, path(64, 4), 8, "indirect", seed=seed)
+
+    parts = [st.mean_and_variance(images) for images in (indirect(1, environment=sky), indirect(2, lights=lights))]
+    total = np.sum(parts, axis=0)
+    together = indirect(3, environment=sky, lights=lights)
+    st.compare_images("sky_and_lights", together, *total, alpha=1e-4, reference_dof=7)
 
 
 def small_scene() -> tuple[gi.Scene, gi.Camera]:

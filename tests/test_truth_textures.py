@@ -87,3 +87,31 @@ def test_coverage_is_bilinear_alpha_against_the_cutoff(wrap):
         seen = frame.numpy("object_id") == 0
         assert 0.1 < seen.mean() < 0.9
         assert np.array_equal(seen[sure], coverage[sure] >= 0)
+
+
+@pytest.mark.parametrize("axes", [(1, 1), (-1, 1), (1, -1)], ids=str)
+@pytest.mark.parametrize("side", [1, -1])
+def test_normal_maps_tilt_along_u_and_v(axes, side):
+    """glTF: red is along rising u, green along rising v, mirrored or not; the back shows the front's normal negated."""
+    image = gi.Texture("tilt", np.uint8([[[191, 153, 230, 255]]]), srgb=False)
+    material = gi.Material("m", specular=0.0, normal_texture=image, normal_scale=0.5)
+    square = quad((-1, -1, 0), (2, 0, 0), (0, 2, 0), material, "square")
+    square = replace(square, uvs=(square.uvs * axes).astype(np.float32))
+    scene = gi.Scene([gi.Node("square", [square])], environment=(1.0, 1.0, 1.0))
+    camera = gi.Camera.look_at((0, 0, side), (0, 0, 0), hfov=20.0, resolution=(3, 3))
+    pipeline = gi.Pipeline(spp=1, camera_samples=1, indirect=None)
+    frame = next(iter(gi.render(scene, camera, pipeline, device=str(st.device()))))
+    x, y, z = np.array([191, 153, 230]) / 255.0 * 2.0 - 1.0
+    tilted = np.array([0.5 * x * axes[0], 0.5 * y * axes[1], z])
+    assert np.allclose(frame.numpy("normal"), side * tilted / np.linalg.norm(tilted), atol=1e-5)
+
+
+def test_roughness_is_green_and_metallic_is_blue():
+    """A texture of one colour looks like the factors it stands for."""
+    green, blue = 77, 179
+    image = gi.Texture("mr", np.uint8([[[255, green, blue, 255]]]), srgb=False)
+    textured = gi.Material("m", (0.9, 0.5, 0.2), metallic=0.8, roughness=0.9, metallic_roughness_texture=image)
+    plain = gi.Material("m", (0.9, 0.5, 0.2), metallic=0.8 * blue / 255, roughness=0.9 * green / 255)
+    images = [picture(material)[0].numpy("environment") for material in (textured, plain)]
+    assert images[0].max() > 0.1
+    assert np.allclose(*images, rtol=1e-3, atol=1e-4)
