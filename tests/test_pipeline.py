@@ -1,9 +1,12 @@
 """Pipeline, scheduler and frame: settings, buffers, motion, determinism."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import warp_gi as gi
+from warp_gi.bench.presets import sphere
 from warp_gi.errors import OptionError
 from warp_gi.launch import set_threads
 
@@ -219,8 +222,31 @@ def test_a_lamp_that_moved_lights_like_one_that_stands_there():
     still = scene(lambda mesh: gi.Node("lamp", [mesh], there))
     moved = scene(lambda mesh: gi.Node("lamp", [mesh]))
     moved.animate("lamp", [gi.Keyframe(0.0), gi.Keyframe(1.0, translation=(1.0, 2.0, 0.5))])
-    path, pipeline = gi.CameraPath.still(camera()), gi.Pipeline(spp=4)
-    at_rest, at_end = gi.render(moved, path, pipeline, frames=[0, 24])
-    expected = next(gi.render(still, path, pipeline, frames=[24]))
-    assert np.allclose(at_end.numpy("beauty"), expected.numpy("beauty"), rtol=1e-4, atol=1e-6)
-    assert not np.allclose(at_rest.numpy("beauty"), expected.numpy("beauty"), rtol=0.1)
+    path = gi.CameraPath.still(camera())
+    for pipeline in (gi.Pipeline(spp=4), gi.Pipeline(spp=4, indirect=None)):  # alone, a path's last rays use the box
+        at_rest, at_end = gi.render(moved, path, pipeline, frames=[0, 24])
+        expected = next(gi.render(still, path, pipeline, frames=[24]))
+        assert np.allclose(at_end.numpy("beauty"), expected.numpy("beauty"), rtol=1e-4, atol=1e-6)
+        assert not np.allclose(at_rest.numpy("beauty"), expected.numpy("beauty"), rtol=0.1)
+
+
+def test_a_scheduler_notices_what_is_replaced_in_its_scene():
+    scene, pipeline = lit_scene(), gi.Pipeline(spp=4)
+    scheduler = gi.FrameScheduler(scene, gi.CameraPath.still(camera()), pipeline)
+    hashes = [scheduler.frame(0).metadata["scene_hash"]]
+    scene.environment = (1.0, 0.0, 0.0)
+    scene.animate("lamp", [gi.Keyframe(0.0, translation=(0.0, 0.5, 0.0))])
+    frame, fresh = scheduler.frame(0), one_frame(scene, pipeline=pipeline)
+    hashes.append(frame.metadata["scene_hash"])
+    assert hashes[0] != hashes[1] == fresh.metadata["scene_hash"]
+    assert np.array_equal(frame.numpy("beauty"), fresh.numpy("beauty"))
+
+
+def test_normals_that_point_to_the_back_of_their_triangles_are_turned():
+    mesh = sphere((0, 0, 0), 1.0, gi.Material(roughness=0.4), rows=8)
+    turned = replace(mesh, normals=-mesh.normals)
+    images = [
+        one_frame(gi.Scene([gi.Node("ball", [m])], environment=(1, 1, 1))).numpy("beauty") for m in (mesh, turned)
+    ]
+    assert images[0][SIZE[1] // 2, SIZE[0] // 2].min() > 0.5
+    assert np.array_equal(*images)

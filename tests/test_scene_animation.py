@@ -94,10 +94,21 @@ def test_lights_follow_their_node():
     scene = Scene([Node("head", keyframes=[Keyframe(0.0), turn]), Node("n", [triangle(LAMP)])], [light])
     emitters = scene.data("cpu").emitters.emitters
     np.testing.assert_allclose(emitters.numpy()["direction"][1], [0, 0, -1])
-    scene.update(1.0, 0.0, "cpu")
+    assert scene.update(1.0, 0.0, "cpu") and not scene.update(1.0, 0.0, "cpu")
     np.testing.assert_allclose(emitters.numpy()["direction"][1], [-1, 0, 0], atol=1e-6)
     np.testing.assert_allclose(emitters.numpy()["position"][1], [0, 3, 0], atol=1e-6)
     assert emitters.numpy()["triangle"][0] == 0
+
+
+def test_the_box_around_emitters_is_larger_than_rounding():
+    far = np.eye(4)
+    far[:3, 3] = 1e5, 0, -2e4
+    for place in (np.eye(4), far):
+        scene = Scene([Node("n", [triangle(LAMP)], place)])
+        box, points = scene.data("cpu").emitters, scene.data("cpu").geometry.points.numpy()
+        ulp = np.spacing(np.abs(points).max())
+        assert (points.min(axis=0) - np.array(box.lower) >= 8 * ulp).all()
+        assert (np.array(box.upper) - points.max(axis=0) >= 8 * ulp).all()
 
 
 def test_a_static_scene_is_not_updated():

@@ -176,14 +176,18 @@ class FrameScheduler:
             self._light_sampler = None
         self._states: dict[str, Any] = {}
         self._bake_seconds = 0.0
-        self._baked = False
+        self._baked_version = -1
         self._scene_hash = ""
 
     def bake(self) -> None:
-        """Let every estimator compute what it can before the first frame; done by the first frame otherwise."""
-        if self._baked:
+        """Let every estimator compute what it can before the first frame; done by the first frame otherwise.
+
+        Done afresh, with all states dropped, when the scene got another environment or animation.
+        """
+        if self._baked_version == self.scene.version:
             return
         started = time.perf_counter()
+        self._states.clear()
         for term, estimator in self._estimators.items():
             self._progress(f"bake {term}", 0.0)
             self._states[term] = estimator.bake(
@@ -191,7 +195,7 @@ class FrameScheduler:
             )
         self._scene_hash = self.scene.hash
         self._bake_seconds = time.perf_counter() - started
-        self._baked = True
+        self._baked_version = self.scene.version
 
     def frame(self, index: int, previous_index: int | None = None) -> Frame:
         """Render frame ``index``; motion is towards frame ``previous_index`` (None: the frame before it, if any)."""

@@ -48,6 +48,8 @@ class Scene:
         camera_nodes: Mapping[str, int] | None = None,
     ) -> None:
         self.name = name
+        self.version = 0
+        """Counts up when the environment or the animation is replaced: what was derived from the scene is stale."""
         self.nodes: list[Node] = [replace(node) for node in nodes]
         self.lights: list[PunctualLight] = list(lights)
         self.cameras: dict[str, Camera] = dict(cameras or {})
@@ -62,6 +64,7 @@ class Scene:
 
     def _flatten(self) -> None:
         """Build what follows from the nodes; call again when keyframes change."""
+        self.version += 1
         self._moving = animation.moving_nodes(self.nodes)
         world = animation.world_matrices(self.nodes, 0.0)
         self._flat = geometry.flatten(self.nodes, self.materials, world)
@@ -86,6 +89,7 @@ class Scene:
 
             value = as_environment(value)
         self._environment = value
+        self.version += 1
         for device_scene in self._devices.values():
             device_scene.set_environment(value)
 
@@ -197,6 +201,10 @@ class Scene:
         animation.check_keyframes(keyframes, node)
         self.nodes[matches[0]].keyframes = list(keyframes)
         self._flatten()
+
+    def moves(self, index: int) -> bool:
+        """Return whether node ``index``, or one above it, has keyframes."""
+        return self._moving[index]
 
     def world_from_node(self, index: int, time: float) -> np.ndarray:
         """Return the placement of node ``index`` at ``time`` [s], float64 [4, 4]."""
@@ -324,7 +332,9 @@ class _DeviceScene:
                 self._upload(target.normals, flat.normals, start, stop)
                 moved = True
         if any(light.node is not None and self.scene._moving[light.node] for light in self.scene.lights):
-            self.emitters[:] = emitters.emitter_table(self.scene._emissive, self.scene.lights, world)
+            table = emitters.emitter_table(self.scene._emissive, self.scene.lights, world)
+            changed |= not np.array_equal(table, self.emitters)
+            self.emitters[:] = table
             self._upload(self.data.emitters.emitters, self.emitters, len(self.scene._emissive), len(self.emitters))
         self.world, self.previous_world = world, previous_world
         if moved:
@@ -333,12 +343,12 @@ class _DeviceScene:
         return moved or changed
 
     def _bound_emitters(self, target: types.Emitters) -> None:
-        """Set the box around all emissive triangles, a little larger than they are."""
+        """Set the box around all emissive triangles, larger by more than rays' rounding near and far of the origin."""
         if len(self.scene._emissive) == 0:
             target.lower, target.upper = wp.vec3(1.0, 1.0, 1.0), wp.vec3(-1.0, -1.0, -1.0)
             return
         corners = self.flat.points[self.flat.indices[self.scene._emissive]].reshape(-1, 3).astype(np.float64)
-        margin = 1e-4 * self.scene.radius
+        margin = 1e-4 * self.scene.radius + 1e-6 * np.abs(corners).max()
         target.lower = wp.vec3(*(corners.min(axis=0) - margin))
         target.upper = wp.vec3(*(corners.max(axis=0) + margin))
 
