@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from scene_tools import GlbBuilder
 
+import warp_gi as gi
 from warp_gi.camera import Camera, CameraKey, CameraPath
+from warp_gi.cli_inputs import scene_camera
+from warp_gi.cli_render import parse, plan
 from warp_gi.errors import GiError, OptionError, SceneError
 
 
@@ -78,6 +81,8 @@ def test_path_survives_a_file(tmp_path):
         (json.dumps({"keyframes": [{"eye": [0, 0, 0]}]}), "target"),
         (json.dumps({"keyframes": [{"eye": [0, 0], "target": [1, 0, 0]}]}), "path.json"),
         (json.dumps({"keyframes": [{"eye": [0, 0, 0], "target": [0, 0, 0]}]}), "cannot look at"),
+        (json.dumps({"keyframes": [{"eye": [0, 0, 1], "target": [0, 0, 0], "time": float("inf")}]}), "finite"),
+        (json.dumps({"keyframes": [{"eye": [0, 0, 1], "target": [0, 0, 0], "time": -1}]}), "0 s or later"),
     ],
 )
 def test_bad_files_are_one_line(tmp_path, text, words):
@@ -110,3 +115,6 @@ def test_path_from_gltf_follows_the_camera_node(tmp_path):
     assert path.camera(5).hfov == pytest.approx(np.degrees(2 * np.arctan(2 * np.tan(0.25))))
     with pytest.raises(OptionError, match="did you mean 'view'"):
         CameraPath.from_gltf(tmp_path / "moving.glb", name="vie")
+    scene = gi.load_scene(tmp_path / "moving.glb")
+    shots = plan(parse([str(tmp_path / "moving.glb")]), scene_camera(scene, "view"))
+    assert len(shots) == 25 and np.allclose(shots[12].camera.position, [1, 0, 5], atol=1e-5)

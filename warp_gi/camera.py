@@ -7,10 +7,14 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from warp_gi.errors import OptionError, SceneError, unknown_name
+
+if TYPE_CHECKING:
+    from warp_gi.scene.scene import Scene
 
 Vec3 = tuple[float, float, float]
 
@@ -134,8 +138,11 @@ class CameraPath:
             raise OptionError("a camera path needs at least one keyframe")
         if any(a.time >= b.time for a, b in zip(self.keys, self.keys[1:], strict=False)):
             raise OptionError("the times of a camera path's keyframes must rise")
-        if not self.fps > 0:
-            raise OptionError(f"fps must be above 0, got {self.fps}")
+        if not (all(math.isfinite(key.time) for key in self.keys) and self.keys[-1].time >= 0):
+            times = [key.time for key in self.keys]
+            raise OptionError(f"keyframe times of a camera path must be finite and end at 0 s or later, got {times}")
+        if not (self.fps > 0 and math.isfinite(self.fps)):
+            raise OptionError(f"fps must be finite and above 0, got {self.fps}")
 
     @property
     def frame_count(self) -> int:
@@ -209,14 +216,22 @@ class CameraPath:
         scene = load_scene(path)
         if not scene.cameras:
             raise SceneError(f"{path}: expected a glTF camera, found none; give a JSON camera path instead")
+        return cls.from_scene(scene, name, fps)
+
+    @classmethod
+    def from_scene(cls, scene: Scene, name: str | None = None, fps: float = 24.0) -> CameraPath:
+        """Return the path of a scene's camera, one key a frame over the scene's animation; it may stand still.
+
+        ``name`` None is the first camera. Raises OptionError if there is none of that name.
+        """
         if name is None:
-            name = next(iter(scene.cameras))
+            name = next(iter(scene.cameras), "")
         if name not in scene.cameras:
             raise unknown_name("camera", name, scene.cameras)
         camera = scene.cameras[name]
         node = scene.camera_nodes.get(name)
-        if node is None:
-            return cls.still(camera)
+        if node is None or not scene.moves(node):
+            return replace(cls.still(camera), fps=fps)
         frames = range(math.floor(scene.duration * fps + 1e-6) + 1)
         poses = [replace(camera, world_from_camera=scene.world_from_node(node, i / fps)) for i in frames]
         return cls.from_cameras(poses, fps=fps)

@@ -73,7 +73,7 @@ def find_camera(options: Render, scene: Scene, report: Reporter) -> Camera | Cam
         return Camera.look_at(options.eye, options.target, hfov=options.hfov or 65.0)
     camera: Camera | CameraPath
     if options.camera in scene.cameras:
-        camera = scene.cameras[options.camera]
+        camera = scene_camera(scene, options.camera)
     elif options.camera.lower().endswith(".json"):
         camera = CameraPath.load(options.camera)
     elif options.camera in BUILTIN_SCENES:
@@ -83,7 +83,7 @@ def find_camera(options: Render, scene: Scene, report: Reporter) -> Camera | Cam
     elif (options.scene or DEFAULT_SCENE) in BUILTIN_SCENES:
         camera = builtin_camera_path(options.scene or DEFAULT_SCENE)
     elif scene.cameras:
-        camera = next(iter(scene.cameras.values()))
+        camera = scene_camera(scene, next(iter(scene.cameras)))
     else:
         report.line("the scene has no camera: showing all of it from outside; --camera or --eye choose another view")
         camera = overview(scene, options.hfov or 65.0)
@@ -92,6 +92,12 @@ def find_camera(options: Render, scene: Scene, report: Reporter) -> Camera | Cam
             raise OptionError("--hfov goes with a still camera; a camera path has its own field of view")
         camera = replace(camera, hfov=options.hfov)
     return camera
+
+
+def scene_camera(scene: Scene, name: str) -> Camera | CameraPath:
+    """Return a camera of the scene; its path if it moves with a node."""
+    path = CameraPath.from_scene(scene, name)
+    return path if len(path.keys) > 1 else scene.cameras[name]
 
 
 def overview(scene: Scene, hfov: float) -> Camera:
