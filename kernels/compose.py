@@ -21,7 +21,8 @@ class FrameSums:
 
 
 # Thread: a pixel. beauty = ((emission + environment) + emitters) + indirect, to the last bit.
-# variance = (E[x^2] - E[x]^2) / (n - 1), which overestimates for stratified samples.
+# variance = (E[x^2] - E[x]^2) / (n - 1), as if samples were independent: too much where they are
+# stratified, too little where many share a camera sample and camera samples differ (edges).
 @wp.kernel
 def compose_frame(first: wp.int32, camera_samples: wp.int32, samples: wp.int32, b: FrameSums):
     i = first + wp.tid()
