@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+
 from warp_gi import launch
 from warp_gi.errors import OptionError
 
