@@ -3,6 +3,7 @@
 import warp as wp
 
 from warp_gi.kernels.alias import alias_choice
+from warp_gi.kernels.bvh import is_masked, is_transparent
 from warp_gi.kernels.sampling import triangle_barycentrics
 from warp_gi.kernels.surface import emitted_radiance
 from warp_gi.kernels.types import (
@@ -93,6 +94,9 @@ def sample_emitter(scene: SceneData, position: wp.vec3, u_select: wp.vec2, u: wp
         material = scene.materials[scene.geometry.materials[light.triangle]]
         if material.double_sided == 0 and wp.dot(wp.cross(p1 - p0, p2 - p0), r.direction) >= 0.0:
             return r
+        if is_masked(scene.bvh, light.triangle):  # no ray meets it where it has a hole
+            if is_transparent(scene.bvh, light.triangle, b[0], b[1]):
+                return r
         r.pdf = triangle_light_pdf(scene, choice.item, light.triangle, r.direction, r.distance)
         r.radiance = emitted_radiance(scene, light.triangle, b[0], b[1])
         return r

@@ -144,6 +144,16 @@ def test_parallel_rectangle_light(sampler):
     st.assert_mean(st.renderings(scene, camera, path(emitters=sampler), 12), expected, tolerance=1e-3)
 
 
+@pytest.mark.parametrize("depth", [2, 3])
+def test_a_lamp_shines_only_where_its_mask_leaves_it(depth):
+    """Half of a rectangle is cut away: what is left lights like a rectangle of half the size."""
+    cut = gi.Texture("cut", np.uint8([[[255, 255, 255, 0], [255, 255, 255, 255]]]), wrap=("clamp", "clamp"))
+    masked = replace(light((3.0, 2.0, 1.0)), base_color_texture=cut, alpha_cutoff=0.5)
+    lamp = quad((-0.5, 1.0, 0), (1.0, 0, 0), (0, 0, 0.7), masked, "lamp")
+    images = st.renderings(scene_of(ground(), lamp), spot_camera((-0.9, 0.5, -0.2)), path(128, depth), 12, "emitters")
+    st.assert_mean(images, ALBEDO * [3.0, 2.0, 1.0] * quarter_form_factor(0.5, 0.7), tolerance=1e-3)
+
+
 def test_many_unequal_lights_add_up():
     """Sixteen rectangles of different strength, one sampled at a time."""
     rng = np.random.default_rng(7)
