@@ -184,8 +184,7 @@ TRAVERSAL = (
         decltype(bvh.textures.data) textures;
         decltype(bvh.texels.data) texels;
 
-        // Keeps the callers' registers: they rarely call it.
-        __attribute__((noinline, cold, preserve_all)) bool transparent(int face, float u, float v) const {%s}
+        __attribute__((noinline, cold)) bool transparent(int face, float u, float v) const {%s}
         inline bool passes(int face, float u, float v) const {
             return __builtin_expect(face & FACE_MASKED, 0) && transparent(face & ~FACE_MASKED, u, v);
         }
@@ -238,10 +237,14 @@ OCCLUDED = (
                     const float* block = block_at(child);
                     f8 t, u, v;
                     unsigned hits = ray.triangles(block, limit, t, u, v);
-                    while (hits) {
-                        const int lane = __builtin_ctz(hits);
-                        if (!passes(((const int*)block)[FACE_WORD + lane], u[lane], v[lane])) return 1;
-                        hits &= hits - 1;
+                    if (hits) {
+                        const int* faces = (const int*)block + FACE_WORD;
+                        if (hits & ~Ray::bits((*(const i8*)faces & FACE_MASKED) != 0)) return 1;
+                        do {
+                            const int lane = __builtin_ctz(hits);
+                            if (!transparent(faces[lane] & ~FACE_MASKED, u[lane], v[lane])) return 1;
+                            hits &= hits - 1;
+                        } while (hits);
                     }
                 }
                 if (!size) return 0;

@@ -257,8 +257,7 @@ def test_reordered_batches_give_the_same_hits_in_the_same_places(monkeypatch):
     origins[17] = np.nan
     limits = rng.uniform(0, 10, 40000).astype(np.float32)
     plain, occluded = tree.intersect(origins, directions, limits), tree.occluded(origins, directions, limits)
-    monkeypatch.setattr(bvh_module, "ORDERED_OCCLUDED_BYTES", 0)
-    monkeypatch.setattr(bvh_module, "ORDERED_INTERSECT_BYTES", 0)
+    monkeypatch.setattr(bvh_module, "ORDERED_BYTES", 0)
     assert tree._order(wp.array(origins, dtype=wp.vec3, device=CPU)) is not None
     assert tree._order(wp.array(np.sort(origins, axis=0) * 0.01, dtype=wp.vec3, device=CPU)) is None
     ordered = tree.intersect(origins, directions, limits)

@@ -19,8 +19,7 @@ from warp_gi.kernels import types
 SUBTREES = 64  # a build is shared out as about this many tasks
 MOST_TASKS = 1024
 ORDERED_RAYS = 1 << 15  # batches of fewer rays are traced as they come,
-ORDERED_OCCLUDED_BYTES = 1 << 25  # and so are those in trees of fewer bytes than this
-ORDERED_INTERSECT_BYTES = 1 << 23
+ORDERED_BYTES = 1 << 25  # and so are those in trees of fewer bytes than this
 HUGE_PAGE = 1 << 21  # bytes
 
 
@@ -115,7 +114,7 @@ class TriangleBvh:
         ``origins`` and ``directions`` are float32 [ray, 3], ``t_max`` a number or float32 [ray], in units of the
         direction's length. Raises SceneError on other shapes.
         """
-        rays = self._rays(origins, directions, t_max, ORDERED_OCCLUDED_BYTES)
+        rays = self._rays(origins, directions, t_max)
         count = len(rays.origins)
         result = wp.empty(count, dtype=wp.uint8, device=self.device)
         launch.launch(batch.occluded_rays, count, [self.data, rays, result], self.device)
@@ -123,7 +122,7 @@ class TriangleBvh:
 
     def intersect(self, origins: object, directions: object, t_max: object = np.inf) -> Hits:
         """Return the closest hits at 0 < t < t_max; arguments and errors as ``occluded``."""
-        rays = self._rays(origins, directions, t_max, ORDERED_INTERSECT_BYTES)
+        rays = self._rays(origins, directions, t_max)
         count = len(rays.origins)
         hits = batch.RayHits()
         hits.t, hits.u, hits.v = (wp.empty(count, dtype=wp.float32, device=self.device) for _ in range(3))
@@ -131,7 +130,7 @@ class TriangleBvh:
         launch.launch(batch.intersect_rays, count, [self.data, rays, hits], self.device)
         return Hits(hits.t, hits.face, hits.u, hits.v)
 
-    def _rays(self, origins: object, directions: object, t_max: object, ordered_bytes: int) -> object:
+    def _rays(self, origins: object, directions: object, t_max: object) -> batch.RayBatch:
         rays = batch.RayBatch()
         rays.origins = _vectors(origins, "ray origins", self.device)
         rays.directions = _vectors(directions, "ray directions", self.device)
@@ -142,7 +141,7 @@ class TriangleBvh:
         if limits.ndim != 1 or len(limits) not in (1, count):
             raise SceneError(f"t_max must be a number or one for each of {count} rays, got shape {limits.shape}")
         rays.t_max = wp.array(limits, dtype=wp.float32, device=self.device, copy=False)
-        if self.device.is_cpu and count >= ORDERED_RAYS and self.memory_bytes >= ordered_bytes:
+        if self.device.is_cpu and count >= ORDERED_RAYS and self.memory_bytes >= ORDERED_BYTES:
             rays.order = self._order(rays.origins)
         return rays
 
