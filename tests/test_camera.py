@@ -34,6 +34,7 @@ def test_axes_are_made_orthonormal():
         (lambda: Camera.look_at((0, 0, 0), (0, 1, 0)), "cannot look at"),
         (lambda: Camera(np.eye(4), hfov=180), "hfov"),
         (lambda: Camera(np.eye(4), resolution=(0, 5)), "resolution"),
+        (lambda: Camera(np.eye(4), resolution=(1 << 16, 1 << 15)), "resolution must be at most"),
         (lambda: Camera(np.full((4, 4), np.nan)), "finite"),
         (lambda: Camera(np.zeros((4, 4))), "singular"),
         (lambda: CameraPath(()), "at least one"),

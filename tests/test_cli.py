@@ -238,6 +238,12 @@ BAD = [
     (["render", "cornell_box", "--device", "tpu"], "device 'tpu' is not available"),
     (["render", "cornell_box", "--threads", "0"], "thread count must be"),
     (["render", "cornell_box", "--seed", "-1"], "seed must be 0 or above"),
+    (["render", "cornell_box", "--frames", "0-1000000000000"], "more than 1,000,000"),
+    (["render", "cornell_box", "--resolution", "1000000x1000000"], "resolution must be at most"),
+    (["render", "cornell_box", "--spp", "5000000000"], "spp must be at most"),
+    (["render", "cornell_box", "--scale", "0"], "go with a scene from a file"),
+    (["render", "cornell_box", "--eye", "0", "1", "3", "--target", "0", "1", "0", "--hfov", "0"], "--hfov must be"),
+    (["render", "cornell_box", "--device", "cuda:77"], "device 'cuda:77' is not available"),
     (["render", "cornell_box", "--frames", "0-1", "-o", "a.exr"], "put #### in the name"),
     (["render", "cornell_box", "--frames", "0", "-o", "a.tif"], ".exr or .png"),
     (["render", "cornell_box", "--frames", "0", "-o", "a.png", "--resume"], "--resume needs .exr"),
@@ -265,6 +271,29 @@ def test_mistakes_are_one_line(arguments, words, capfd, tmp_path, monkeypatch):
     assert error.startswith("warp-gi: error: ") and error.count("\n") == 1 and "Traceback" not in error
     assert words in error
     assert list(tmp_path.iterdir()) == []
+
+
+def test_warnings_are_one_line(capfd, tmp_path):
+    (tmp_path / "a.obj").write_text("mtllib gone.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\n")
+    assert cli.main(["info", str(tmp_path / "a.obj")]) == 0
+    error = capfd.readouterr().err
+    assert error.startswith("warp-gi: warning: ") and error.count("\n") == 1 and "gone.mtl" in error
+
+
+def test_no_memory_is_one_line(capfd, monkeypatch):
+    def fails(arguments):
+        raise RuntimeError("Failed to allocate 768000000000 bytes on device 'cpu'")
+
+    monkeypatch.setattr(cli, "_dispatch", fails)
+    assert cli.main(["info", "x"]) == 2
+    assert capfd.readouterr().err.startswith("warp-gi: error: not enough memory: Failed to allocate 768")
+
+
+def test_a_folder_in_the_way_is_named(capfd, tmp_path):
+    (tmp_path / "a.exr").mkdir()
+    small = ["--resolution", "4x4", "--spp", "1", "--frames", "0", "--quiet"]
+    assert cli.main(["render", "cornell_box", *small, "-o", str(tmp_path / "a.exr")]) == 2
+    assert f"{tmp_path / 'a.exr'}: Is a directory" in capfd.readouterr().err
 
 
 def test_traceback_on_demand(monkeypatch):

@@ -361,6 +361,7 @@ def test_negative_pixels_become_zero_with_a_warning(tmp_path):
         lambda: Environment.constant((1, -1, 0)),
         lambda: Environment.constant((1, math.nan, 0)),
         lambda: as_environment(object()),
+        lambda: as_environment(np.ones((4, 4, 3))),
         lambda: Environment(pixels=np.ones((4, 8, 3)), color=(1, 1, 1)),
         lambda: Environment(pixels=np.ones((0, 0, 3))),
         lambda: Environment(pixels=-np.ones((4, 8, 3))),

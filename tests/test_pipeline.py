@@ -46,6 +46,8 @@ def one_frame(scene=None, view=None, pipeline=None, **settings):
     "make, words",
     [
         (lambda: gi.Pipeline(spp=0), "spp"),
+        (lambda: gi.Pipeline(spp=1.5), "spp must be a whole number"),
+        (lambda: gi.Pipeline(spp=1 << 40), "spp must be at most"),
         (lambda: gi.Pipeline(spp=4, camera_samples=5), "camera_samples"),
         (lambda: gi.Pipeline(filter="gauss"), "pixel filter"),
         (lambda: gi.Pipeline(indirect=gi.PowerLights()), "indirect"),

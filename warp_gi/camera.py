@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 Vec3 = tuple[float, float, float]
 
+LARGEST_SIDE = 1 << 16  # pixels; their Morton code has 16 bits an axis
+LARGEST_COUNT = 1 << 30  # pixels; kernels count them in int32
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -54,6 +57,10 @@ class Camera:
             raise OptionError(f"resolution must be (width, height), got {self.resolution!r}") from error
         if width < 1 or height < 1:
             raise OptionError(f"resolution must be at least 1x1, got {width}x{height}")
+        if max(width, height) > LARGEST_SIDE or width * height > LARGEST_COUNT:
+            raise OptionError(
+                f"resolution must be at most {LARGEST_SIDE} a side and {LARGEST_COUNT:,} pixels, got {width}x{height}"
+            )
         object.__setattr__(self, "resolution", (width, height))
 
     @classmethod

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -51,7 +52,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code: 0, 2 after an error, 130 when interrupted."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        return _dispatch(arguments)
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            return _dispatch(arguments)
     except BrokenPipeError:  # the reader of our output has gone, as in `warp-gi info x | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
@@ -59,6 +62,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if os.environ.get("WARP_GI_DEBUG", "0") != "0":
             raise
         print(f"warp-gi: error: {_one_line(error)}", file=sys.stderr)
+        return EXIT_ERROR
+    except RuntimeError as error:
+        if "Failed to allocate" not in str(error) or os.environ.get("WARP_GI_DEBUG", "0") != "0":
+            raise
+        print(f"warp-gi: error: not enough memory: {_one_line(error)}", file=sys.stderr)  # Warp's own allocators
         return EXIT_ERROR
     except KeyboardInterrupt as interrupt:
         print(": ".join(["warp-gi: interrupted", *map(str, interrupt.args)]), file=sys.stderr)
@@ -80,11 +88,15 @@ def _dispatch(arguments: list[str]) -> int:
     return importlib.import_module(COMMANDS[arguments[0]].module).main(arguments[1:])
 
 
-def _one_line(error: BaseException) -> str:
+def _show_warning(message: Warning | str, *where: object, **more: object) -> None:
+    print(f"warp-gi: warning: {_one_line(message)}", file=sys.stderr)
+
+
+def _one_line(error: BaseException | str) -> str:
     if isinstance(error, MemoryError):
         return f"not enough memory {error}".strip()
     if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
+        return f"{error.filename2 or error.filename}: {error.strerror}"  # of a rename, the target
     return " ".join(str(error).split())
 
 

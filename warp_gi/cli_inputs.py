@@ -27,6 +27,8 @@ DEFAULT_SCENE = "atrium"
 def open_scene(name: str, smooth: float | None = None, scale: float = 1.0) -> Scene:
     """Return a built-in scene by name, or one from a file (``smooth`` and ``scale`` are those of ``load_scene``)."""
     if name in BUILTIN_SCENES and not Path(name).is_file():
+        if smooth is not None or scale != 1.0:
+            raise OptionError(f"--smooth and --scale go with a scene from a file; {name} is built in")
         return builtin_scene(name)
     if not Path(name).suffix and not Path(name).exists():
         raise unknown_name("scene", name, BUILTIN_SCENES)
@@ -67,6 +69,8 @@ def find_camera(options: Render, scene: Scene, report: Reporter) -> Camera | Cam
     """Return the camera or path that was asked for."""
     if (options.eye is None) != (options.target is None):
         raise OptionError("--eye and --target go together; give both")
+    if options.hfov is not None and not 0.0 < options.hfov < 180.0:
+        raise OptionError(f"--hfov must be between 0 and 180 degrees, got {options.hfov:g}")
     if options.eye is not None:
         if options.camera:
             raise OptionError("--camera and --eye exclude each other; give one")

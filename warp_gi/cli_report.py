@@ -145,11 +145,11 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]
 
 
 def start_warp(device: str = "cpu") -> None:
-    """Start Warp without its greeting and module log; on the CPU also without its word on a missing CUDA driver."""
+    """Start Warp without its greeting, module log, or word on a missing CUDA driver; check that the device is there.
+
+    Raises OptionError if it is not.
+    """
     wp.config.log_level = wp.LOG_WARNING
-    if device != "cpu":
-        wp.init()
-        return
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
@@ -159,6 +159,7 @@ def start_warp(device: str = "cpu") -> None:
         os.dup2(kept, 2)
         os.close(kept)
         os.close(nowhere)
+    launch.get_device(device)
 
 
 def _cell(value: Any) -> str:

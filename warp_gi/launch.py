@@ -70,6 +70,8 @@ def _checked_threads(value: object) -> int:
 def get_device(name: str | None) -> wp.Device:
     """Return the Warp device of that name ("cpu", "cuda", "cuda:1"); raises OptionError if it is not there."""
     try:
+        if name and name.startswith("cuda") and not wp.is_cuda_available():  # Warp would print before it raises
+            raise RuntimeError("Warp finds no CUDA driver or GPU")
         return wp.get_device(name or "cpu")
     except (RuntimeError, ValueError) as error:
         known = ", ".join(device.alias for device in wp.get_devices())

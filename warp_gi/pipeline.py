@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
+from numbers import Integral
 from typing import Any
 
 from warp_gi.errors import OptionError, unknown_name
@@ -14,6 +15,7 @@ __all__ = ["PRESETS", "TERMS", "Estimator", "Pipeline"]
 
 TERMS = ("environment", "emitters", "indirect")
 FILTERS = ("box", "tent")
+MOST_SAMPLES = 1 << 24  # a pixel; random numbers count samples and pixels together in 32 bits
 
 
 @dataclass(frozen=True)
@@ -38,8 +40,14 @@ class Pipeline:
     """Pixel filter: "box" or "tent" (two pixels wide)."""
 
     def __post_init__(self) -> None:
+        for name in ("spp", "camera_samples"):
+            count = getattr(self, name)
+            if count is not None and (isinstance(count, bool) or not isinstance(count, Integral)):
+                raise OptionError(f"{name} must be a whole number, got {count!r}")
         if self.spp < 1:
             raise OptionError(f"spp must be at least 1, got {self.spp}")
+        if self.spp > MOST_SAMPLES:
+            raise OptionError(f"spp must be at most {MOST_SAMPLES}, got {self.spp}; average frames of other seeds")
         if self.camera_samples is not None and not 1 <= self.camera_samples <= self.spp:
             raise OptionError(f"camera_samples must be between 1 and spp ({self.spp}), got {self.camera_samples}")
         if self.filter not in FILTERS:

@@ -23,6 +23,7 @@ from warp_gi.exr import Attribute, plain, read_exr, stored_values, write_exr
 from warp_gi.files import replacing
 from warp_gi.preview import tone_map, write_png
 
+MOST_FRAMES = 1_000_000
 PREFIX = "warp_gi/"
 TIMES = "warp_gi/seconds/"
 
@@ -96,7 +97,10 @@ def parse_frames(text: str) -> list[int]:
         first, last, step = (int(g) if g else None for g in match.groups()) if match else (0, -1, 1)
         if not match or (last is not None and last < first) or step == 0:
             raise OptionError(f"frames {text!r} not understood; write for example 5, 0-47, 0-47:2 or 1,4,9-12")
-        frames.update(dict.fromkeys(range(first, (first if last is None else last) + 1, step or 1)))
+        span = range(first, (first if last is None else last) + 1, step or 1)
+        if len(span) + len(frames) > MOST_FRAMES:
+            raise OptionError(f"frames {text!r} are more than {MOST_FRAMES:,}; render them in parts")
+        frames.update(dict.fromkeys(span))
     return list(frames)
 
 

@@ -208,8 +208,9 @@ def _checked_color(rgb: object) -> Color:
     except (TypeError, ValueError):
         color = np.zeros(0)
     if color.shape != (3,) or not np.isfinite(color).all() or (color < 0).any():
+        got = f"an array of shape {color.shape}" if color.ndim > 1 else repr(rgb)[:100]
         raise SceneError(
-            f"environment must be a file, an RGB triple of finite numbers of at least 0, or SunSky(...), got {rgb!r}"
+            f"environment must be a file, an RGB triple of finite numbers of at least 0, or SunSky(...), got {got}"
         )
     return tuple(color.tolist())
 
