@@ -252,3 +252,13 @@ def test_normals_that_point_to_the_back_of_their_triangles_are_turned():
     ]
     assert images[0][SIZE[1] // 2, SIZE[0] // 2].min() > 0.5
     assert np.array_equal(*images)
+
+
+def test_variance_of_an_edge_counts_the_sky_beside_it():
+    """A black card before a white sky: a pixel's samples are 0 or 1, so its variance follows from its mean."""
+    black = gi.Material("black", (0.0, 0.0, 0.0), specular=0.0)
+    scene = gi.Scene([gi.Node("card", [quad(material=black)])], environment=(1.0, 1.0, 1.0))
+    frame = one_frame(scene, pipeline=gi.Pipeline(spp=16, camera_samples=16))
+    mean = frame.numpy("beauty").astype(np.float64)
+    assert ((mean > 0.1) & (mean < 0.9)).any()
+    assert np.allclose(frame.numpy("variance"), mean * (1.0 - mean) / 15.0, atol=1e-6)

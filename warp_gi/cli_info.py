@@ -8,7 +8,6 @@ from typing import Annotated
 
 import tyro
 
-from warp_gi.camera import CameraPath
 from warp_gi.cli_inputs import open_scene
 from warp_gi.cli_options import parse_options
 from warp_gi.cli_report import print_table, start_warp
@@ -49,7 +48,6 @@ def main(arguments: Sequence[str]) -> int:
     if scene.cameras:
         rows = []
         for name, camera in scene.cameras.items():
-            camera = camera.camera(0) if isinstance(camera, CameraPath) else camera
             rows.append((name, _numbers(camera.position), _numbers(-camera.world_from_camera[:3, 2]), camera.hfov))
         print_table("cameras", ("name", "position [m]", "direction", "hfov [deg]"), rows)
     return 0
