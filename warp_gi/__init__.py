@@ -15,7 +15,6 @@ _PUBLIC = {
     "GiError": "warp_gi.errors",
     "SceneError": "warp_gi.errors",
     "OptionError": "warp_gi.errors",
-    "BakeError": "warp_gi.errors",
     "TriangleBvh": "warp_gi.bvh",
     "Hits": "warp_gi.bvh",
     "Scene": "warp_gi.scene.scene",

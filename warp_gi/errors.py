@@ -18,10 +18,6 @@ class OptionError(GiError):
     """A setting or option is unknown or out of range."""
 
 
-class BakeError(GiError):
-    """A saved bake or state is damaged, or belongs to something else."""
-
-
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> OptionError:
     """Return an error for an unknown ``name`` that lists the known ones and the nearest match."""
     known = sorted(known)
