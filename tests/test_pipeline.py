@@ -60,6 +60,10 @@ def one_frame(scene=None, view=None, pipeline=None, **settings):
         (lambda: list(gi.render(lit_scene(), camera(), device="cuda:77")), "not available"),
         (lambda: list(gi.render(lit_scene(), camera(), frames=[-1])), "frame numbers"),
         (lambda: list(gi.render(lit_scene(), camera(), seed=-1)), "seed"),
+        (lambda: list(gi.render(lit_scene(), camera(), seed=1.5)), "seed must be a whole number"),
+        (lambda: list(gi.render(lit_scene(), camera(), "path")), "pipeline must be a Pipeline, got 'path'"),
+        (lambda: list(gi.render(lit_scene(), None)), "camera must be a Camera or CameraPath"),
+        (lambda: list(gi.render("atrium", camera())), "scene must be a Scene"),
         (lambda: one_frame()["beuty"], "did you mean 'beauty'"),
     ],
 )

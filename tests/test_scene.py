@@ -69,6 +69,11 @@ def test_unusable_normals_are_shaded_flat():
     np.testing.assert_array_equal(scene.data("cpu").geometry.normals.numpy(), [[0, 0, 0], [0, 0, 1], [0, 0, 1]])
 
 
+def test_unusable_texture_coordinates_become_finite():
+    scene = Scene([Node("n", [triangle(uvs=np.float32([[np.nan, 0.5], [np.inf, -np.inf], [3e38, -3e38]]))])])
+    np.testing.assert_array_equal(scene.data("cpu").geometry.uvs.numpy(), np.float32([[0, 0.5], [0, 0], [1e9, -1e9]]))
+
+
 def test_textures_are_packed_bottom_row_first_and_shared_pixels_once():
     pixels = checker()
     color = Texture("c", pixels, True, ("clamp", "mirror"))

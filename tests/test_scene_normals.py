@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from warp_gi.errors import OptionError
+from warp_gi.scene.loading import load_scene
 from warp_gi.scene.model import Mesh
 from warp_gi.scene.normals import smooth_mesh
 
@@ -65,6 +66,10 @@ def test_seams_of_texture_coordinates_stay():
 
 
 @pytest.mark.parametrize("angle", [-1.0, 181.0, float("nan")])
-def test_an_impossible_angle_is_an_error(angle):
+def test_an_impossible_angle_is_an_error(angle, tmp_path):
     with pytest.raises(OptionError, match="angle from 0 to 180 degrees"):
         smooth_mesh(CUBE, angle)
+    file = tmp_path / "a.ply"  # whatever is in it
+    file.touch()
+    with pytest.raises(OptionError, match="angle from 0 to 180 degrees"):
+        load_scene(file, smooth=angle)

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import contextmanager
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -163,6 +164,15 @@ class FrameScheduler:
         seed: int = 0,
         progress: Callable[[str, float], None] | None = None,
     ) -> None:
+        for what, value, kinds in (
+            ("scene", scene, Scene),
+            ("camera", camera, (Camera, CameraPath)),
+            ("pipeline", pipeline, Pipeline),
+            ("seed", seed, Integral),
+        ):
+            if not isinstance(value, kinds):
+                names = " or ".join(kind.__name__ for kind in (kinds if isinstance(kinds, tuple) else (kinds,)))
+                raise OptionError(f"{what} must be a {names.replace('Integral', 'whole number')}, got {value!r:.80}")
         if seed < 0:
             raise OptionError(f"seed must be 0 or above, got {seed}")
         self.scene, self.pipeline, self.seed = scene, pipeline, seed

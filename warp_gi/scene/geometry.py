@@ -12,6 +12,9 @@ from warp_gi.scene.animation import check_keyframes
 from warp_gi.scene.model import Material, Mesh, Node
 from warp_gi.scene.textures import check_material
 
+LARGEST_UV = 1e9
+"""Texture coordinates past it carry no position in float32; infinite ones would make NaN pixels."""
+
 
 @dataclass(eq=False)
 class FlatGeometry:
@@ -128,7 +131,9 @@ def flatten(nodes: Sequence[Node], materials: Sequence[Material], world: Sequenc
             vertices = slice(vertex, vertex + len(mesh.points))
             triangles = slice(triangle, triangle + len(mesh.indices))
             if mesh.uvs is not None:
-                flat.uvs[vertices] = np.nan_to_num(mesh.uvs)
+                flat.uvs[vertices] = np.clip(
+                    np.nan_to_num(mesh.uvs, nan=0.0, posinf=0.0, neginf=0.0), -LARGEST_UV, LARGEST_UV
+                )
             flat.indices[triangles] = np.asarray(mesh.indices)[:, ::-1] if mirrored else mesh.indices
             flat.indices[triangles] += vertex
             flat.materials[triangles] = index_of[id(mesh.material)]

@@ -42,6 +42,8 @@ def load_scene(
         raise missing_file(path, "scene file")
     if suffix not in EXTENSIONS:
         raise SceneError(f"{str(path)!r}: unknown kind of file {suffix!r}; expected one of {', '.join(EXTENSIONS)}")
+    if smooth is not None and not 0.0 <= smooth <= 180.0:
+        raise OptionError(f"smooth must be an angle from 0 to 180 degrees, got {smooth}")
     if not (np.isfinite(scale) and scale > 0.0):
         raise OptionError(f"scale must be a finite number above 0, got {scale}")
     try:
