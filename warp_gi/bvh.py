@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import mmap
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -182,10 +183,10 @@ class TriangleBvh:
     def _build(self) -> None:
         count, device = self.triangle_count, self.device
         build = building.BuildData()
-        build.refs = _empty(8 * count, wp.float32)
-        build.nodes = _empty(8 * (2 * count - 1), wp.float32)
-        build.costs = _empty(8 * (2 * count - 1), wp.float32)
-        build.choices = _empty(8 * (2 * count - 1), wp.uint8)
+        build.refs = wp.empty(8 * count, dtype=wp.float32, device=device)
+        build.nodes = wp.empty(8 * (2 * count - 1), dtype=wp.float32, device=device)
+        build.costs = wp.empty(8 * (2 * count - 1), dtype=wp.float32, device=device)
+        build.choices = wp.empty(8 * (2 * count - 1), dtype=wp.uint8, device=device)
         build.tasks = wp.empty(4 * MOST_TASKS, dtype=wp.int32, device=device)
         build.top = wp.empty(MOST_TASKS, dtype=wp.int32, device=device)
         build.counts = wp.full(4, -1, dtype=wp.int32, device=device)
@@ -194,8 +195,8 @@ class TriangleBvh:
         launch.launch(building.split_top, 1, [build, max(count // SUBTREES, 512)], device)
         launch.launch(building.build_subtrees, int(counts[0]), [build], device, smallest_slice=1)
         launch.launch(building.widen, 1, [build, None, None], device)
-        self.data.nodes = _empty(layout.NODE_WORDS * int(counts[2]), wp.uint32)
-        self.data.blocks = _empty(layout.BLOCK_WORDS * int(counts[3]), wp.float32)
+        self.data.nodes = _empty_huge(layout.NODE_WORDS * int(counts[2]), wp.uint32)
+        self.data.blocks = _empty_huge(layout.BLOCK_WORDS * int(counts[3]), wp.float32)
         launch.launch(building.widen, 1, [build, self.data.nodes, self.data.blocks], device)
         self._fill()
 
@@ -204,8 +205,10 @@ class TriangleBvh:
         points = self._positions.numpy()
         self._bounds = points.min(axis=0), points.max(axis=0)
         blocks, nodes, device = self.data.blocks, self.data.nodes, self.device
-        block_boxes = _empty(building.BOX_WORDS * (len(blocks) // layout.BLOCK_WORDS), wp.float32)
-        node_boxes = _empty(building.BOX_WORDS * (len(nodes) // layout.NODE_WORDS), wp.float32)
+        block_boxes = wp.empty(
+            building.BOX_WORDS * (len(blocks) // layout.BLOCK_WORDS), dtype=wp.float32, device=device
+        )
+        node_boxes = wp.empty(building.BOX_WORDS * (len(nodes) // layout.NODE_WORDS), dtype=wp.float32, device=device)
         geometry = [self._positions, self._indices, self.data.face_masks]
         launch.launch(building.fill_blocks, len(blocks) // layout.BLOCK_WORDS, [*geometry, blocks, block_boxes], device)
         launch.launch(building.fill_nodes, 1, [nodes, block_boxes, node_boxes], device)
@@ -222,15 +225,16 @@ def _make_mesh(points: wp.array, corners: np.ndarray, positions: np.ndarray) -> 
     return wp.Mesh(points, indices)
 
 
-def _empty(length: int, dtype: type) -> wp.array:
+def _empty_huge(length: int, dtype: type) -> wp.array:
     """Return an uninitialised CPU array aligned to pages, huge ones where the system has them."""
     size = max(length * np.dtype(wp.dtype_to_numpy(dtype)).itemsize, 1)
-    memory = mmap.mmap(-1, size)
+    if hasattr(mmap, "MAP_PRIVATE"):
+        memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    else:
+        memory = mmap.mmap(-1, size)
     if size >= HUGE_PAGE and hasattr(mmap, "MADV_HUGEPAGE"):
-        try:
+        with contextlib.suppress(OSError):  # a hint: without huge pages queries are slower, not wrong
             memory.madvise(mmap.MADV_HUGEPAGE)
-        except OSError as error:  # a kernel without transparent huge pages: only slower
-            wp.utils.warn(f"huge pages are not available: {error}", once=True)
     view = np.frombuffer(memory, dtype=wp.dtype_to_numpy(dtype), count=length)
     return wp.array(view, dtype=dtype, device="cpu", copy=False)
 
