@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import sys
 import warnings
 from collections.abc import Sequence
@@ -50,6 +51,7 @@ WARP_GI_DEBUG=1 shows where they came from.
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code: 0, 2 after an error, 130 when interrupted."""
+    is_process = arguments is None
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
         with warnings.catch_warnings():
@@ -69,6 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"warp-gi: error: not enough memory: {_one_line(error)}", file=sys.stderr)  # Warp's own allocators
         return EXIT_ERROR
     except KeyboardInterrupt as interrupt:
+        if is_process:  # a second Ctrl-C would break off the interpreter's leaving with a traceback
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         print(": ".join(["warp-gi: interrupted", *map(str, interrupt.args)]), file=sys.stderr)
         return EXIT_INTERRUPTED
 
