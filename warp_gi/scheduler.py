@@ -87,7 +87,8 @@ class Frame:
         for name in ("t", "u", "v"):
             setattr(self.hits, name, zeros(wp.float32))
         self.hits.face = zeros(wp.int32)
-        self.camera_data = camera_data(camera)
+        self.camera_data, self._previous_camera_data = camera_data(camera), camera_data(previous_camera)
+        self._sky_probability = _sky_probability(scene)
         self.pass_settings = gbuffer.PassSettings()
 
     @property
@@ -277,11 +278,9 @@ class FrameScheduler:
         settings.tent = int(pipeline.filter == "tent")
         with frame.stage("primary"):
             frame.launch_tiled(gbuffer.trace_primary, [frame.data, frame.camera_data, settings, frame.hits])
-            previous = camera_data(frame.previous_camera)
+            cameras = [frame.camera_data, frame._previous_camera_data]
             buffers = frame._struct(gbuffer.SurfaceBuffers)
-            frame.launch(
-                gbuffer.shade_primary, [frame.data, frame.camera_data, previous, settings, frame.hits, buffers]
-            )
+            frame.launch(gbuffer.shade_primary, [frame.data, *cameras, settings, frame.hits, buffers])
         frame._path_terms = 0
         for term, estimator in self._estimators.items():
             with frame.stage(term):
@@ -292,7 +291,7 @@ class FrameScheduler:
             paths.max_depth = frame._paths.max_depth
             paths.roulette_depth = frame._paths.roulette_depth
             paths.clamp = frame._paths.clamp
-            paths.sky_probability = _sky_probability(self.scene)
+            paths.sky_probability = frame._sky_probability
             buffers = frame._struct(path_trace.PathBuffers)
             frame.launch_tiled(
                 path_trace.trace_paths, [frame.data, frame.camera_data, settings, paths, frame.hits, buffers]
