@@ -7,7 +7,7 @@ direction's length, and pass through alpha-masked texels; only CUDA's any-hit qu
 
 import warp as wp
 
-from warp_gi.kernels.bvh_native import INTERSECT, OCCLUDED, TRANSPARENT, cpu_only
+from warp_gi.kernels.bvh_native import BLOCK_STEPS, INTERSECT, OCCLUDED, TRANSPARENT, cpu_only
 from warp_gi.kernels.types import Bvh
 
 wp.set_module_options({"enable_backward": False})
@@ -41,7 +41,7 @@ def is_transparent(bvh: Bvh, face: wp.int32, u: wp.float32, v: wp.float32) -> wp
 
 
 @wp.func_native(cpu_only(OCCLUDED, "return 0;"))
-def wide_occluded(bvh: Bvh, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.int32: ...
+def wide_occluder(bvh: Bvh, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32, hint: wp.int32) -> wp.int32: ...
 
 
 @wp.func_native(cpu_only(INTERSECT, "return wp::vec4();"))
@@ -138,7 +138,20 @@ def mesh_occluded(bvh: Bvh, origin: wp.vec3, direction: wp.vec3, t_max: wp.float
 def bvh_occluded(bvh: Bvh, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.int32:
     if runs_on_cuda() != 0:
         return mesh_occluded(bvh, origin, direction, t_max)
-    return wide_occluded(bvh, origin, direction, t_max)
+    return wp.int32(wide_occluder(bvh, origin, direction, t_max, 0) != 0)
+
+
+# As bvh_occluded, for rays like others before: tries first what lies below the node `hint`, where the last such ray
+# ended, and returns 0 if nothing is in the way, else the hint for the next ray plus 1. Boxes nest, so a ray that meets
+# a block meets every box above it too, and a hint never changes whether it is occluded. CUDA has no use for hints.
+@wp.func
+def bvh_occluder(bvh: Bvh, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32, hint: wp.int32) -> wp.int32:
+    if runs_on_cuda() != 0:
+        return mesh_occluded(bvh, origin, direction, t_max)
+    block = wide_occluder(bvh, origin, direction, t_max, hint)
+    if block == 0:
+        return 0
+    return bvh.parents[(-1 - block) / BLOCK_STEPS] + 1
 
 
 # The closest hit on origin + t direction with 0 < t < t_max.

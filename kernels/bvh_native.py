@@ -203,20 +203,22 @@ QUERY = """
         (const char*)bvh.nodes.data, (const char*)bvh.blocks.data, bvh.face_masks.data, bvh.masks.data,
         bvh.indices.data, bvh.uvs.data, bvh.textures.data, bvh.texels.data
     };
-    return query.run(origin[0], origin[1], origin[2], direction[0], direction[1], direction[2], t_max);
+    return query.run(origin[0], origin[1], origin[2], direction[0], direction[1], direction[2], t_max%s);
 """
 
+# Returns the child (a block) that is in the ray's way, or 0. What lies below the node `hint` is tried first.
 OCCLUDED = (
     TRAVERSAL
     + """
         __attribute__((noinline)) int run(
-            float ox, float oy, float oz, float dx, float dy, float dz, float t_max
+            float ox, float oy, float oz, float dx, float dy, float dz, float t_max, int hint
         ) const {
             Ray ray;
             if (!ray.setup((f4) {ox, oy, oz, 0.0f}, (f4) {dx, dy, dz, 1.0f})) return 0;
             const float limit = t_max / ray.scale;
             int stack[STACK_SIZE];
-            int size = 0, child = 0;
+            int size = 0, child = hint;
+            if (hint) stack[size++] = 0;  // the root, should nothing below the hint be in the way
             while (true) {
                 if (child >= 0) {
                     const char* node = node_at(child);
@@ -239,10 +241,10 @@ OCCLUDED = (
                     unsigned hits = ray.triangles(block, limit, t, u, v);
                     if (hits) {
                         const int* faces = (const int*)block + FACE_WORD;
-                        if (hits & ~Ray::bits((*(const i8*)faces & FACE_MASKED) != 0)) return 1;
+                        if (hits & ~Ray::bits((*(const i8*)faces & FACE_MASKED) != 0)) return child;
                         do {
                             const int lane = __builtin_ctz(hits);
-                            if (!transparent(faces[lane] & ~FACE_MASKED, u[lane], v[lane])) return 1;
+                            if (!transparent(faces[lane] & ~FACE_MASKED, u[lane], v[lane])) return child;
                             hits &= hits - 1;
                         } while (hits);
                     }
@@ -253,7 +255,7 @@ OCCLUDED = (
         }
     };
 """
-    + QUERY
+    + QUERY % ", hint"
 )
 
 # The stack holds what is left to visit, each node's children from far to near.
@@ -324,5 +326,5 @@ INTERSECT = (
         }
     };
 """
-    + QUERY
+    + QUERY % ""
 )

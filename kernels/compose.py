@@ -16,13 +16,23 @@ class FrameSums:
     normal: wp.array(dtype=wp.vec3)
     moment1: wp.array(dtype=wp.vec3)
     moment2: wp.array(dtype=wp.vec3)
+    field_moment1: wp.array(dtype=wp.vec3)  # of an environment term that was not path traced with the rest, or empty
+    field_moment2: wp.array(dtype=wp.vec3)
     beauty: wp.array(dtype=wp.vec3)
     variance: wp.array(dtype=wp.vec3)  # of the mean
 
 
+# From the sums of n samples and of their squares.
+@wp.func
+def variance_of_mean(sum: wp.vec3, squares: wp.vec3, n: wp.float32) -> wp.vec3:
+    mean = sum / n
+    return wp.max(squares / n - wp.cw_mul(mean, mean), wp.vec3(0.0, 0.0, 0.0)) / (n - 1.0)
+
+
 # Thread: a pixel. beauty = ((emission + environment) + emitters) + indirect, to the last bit.
 # variance = (E[x^2] - E[x]^2) / (n - 1), as if samples were independent: too much where they are
-# stratified, too little where many share a camera sample and camera samples differ (edges).
+# stratified, too little where many share a camera sample and camera samples differ (edges). Terms of other launches are
+# independent of the path tracer's, so their variance adds.
 @wp.kernel
 def compose_frame(first: wp.int32, camera_samples: wp.int32, samples: wp.int32, b: FrameSums):
     i = first + wp.tid()
@@ -39,6 +49,7 @@ def compose_frame(first: wp.int32, camera_samples: wp.int32, samples: wp.int32, 
     b.albedo[i] = b.albedo[i] / views
     b.normal[i] = b.normal[i] / views
     b.beauty[i] = emission + environment + emitters + indirect
-    mean = b.moment1[i] / n
     if samples > 1:
-        b.variance[i] = wp.max(b.moment2[i] / n - wp.cw_mul(mean, mean), wp.vec3(0.0, 0.0, 0.0)) / (n - 1.0)
+        b.variance[i] = variance_of_mean(b.moment1[i], b.moment2[i], n)
+        if b.field_moment1.shape[0] > 0:
+            b.variance[i] = b.variance[i] + variance_of_mean(b.field_moment1[i], b.field_moment2[i], n)

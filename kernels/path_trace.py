@@ -256,8 +256,12 @@ def trace_paths(
         buffers.moment1[pixel] = buffers.moment1[pixel] + sky * count
         buffers.moment2[pixel] = buffers.moment2[pixel] + wp.cw_mul(sky, sky) * count
         return
-    s = surface_at(scene, face, hits.u[pixel], hits.v[pixel], -direction)
     emission = surface_emission(scene, face, hits.u[pixel], hits.v[pixel], -direction)
+    if paths.terms == 0:
+        buffers.moment1[pixel] = buffers.moment1[pixel] + emission * count
+        buffers.moment2[pixel] = buffers.moment2[pixel] + wp.cw_mul(emission, emission) * count
+        return
+    s = surface_at(scene, face, hits.u[pixel], hits.v[pixel], -direction)
     seed = pixel_seed(p[0], p[1], settings.sample_bits, settings.seed)
     environment = wp.vec3(0.0, 0.0, 0.0)
     emitters = wp.vec3(0.0, 0.0, 0.0)

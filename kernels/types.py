@@ -123,7 +123,8 @@ class AlphaMask:
 class Bvh:
     mesh: wp.uint64  # wp.Mesh id, 0 on the CPU
     nodes: wp.array(dtype=wp.uint32)  # [node * NODE_WORDS] eight-wide, node 0 is the root
-    blocks: wp.array(dtype=wp.float32)  # [block * BLOCK_WORDS] four triangles each
+    blocks: wp.array(dtype=wp.float32)  # [block * BLOCK_WORDS] eight triangles each
+    parents: wp.array(dtype=wp.int32)  # [block] the node above it
     face_masks: wp.array(dtype=wp.int32)  # [triangle] index in masks, -1 is opaque; empty where all are
     masks: wp.array(dtype=AlphaMask)
     indices: wp.array(dtype=wp.vec3i)  # [triangle] for uvs; empty where all are opaque

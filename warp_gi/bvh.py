@@ -95,7 +95,7 @@ class TriangleBvh:
     def memory_bytes(self) -> int:
         """Bytes of the tree itself, without vertices, indices and textures."""
         if self.device.is_cpu:
-            return self.data.nodes.capacity + self.data.blocks.capacity
+            return self.data.nodes.capacity + self.data.blocks.capacity + self.data.parents.capacity
         return 3 * 32 * self.triangle_count  # wp.Mesh: two binary nodes and the bounds of each triangle
 
     def refit(self, points: object) -> None:
@@ -198,6 +198,7 @@ class TriangleBvh:
         self.data.nodes = _empty_huge(layout.NODE_WORDS * int(counts[2]), wp.uint32)
         self.data.blocks = _empty_huge(layout.BLOCK_WORDS * int(counts[3]), wp.float32)
         launch.launch(building.widen, 1, [build, self.data.nodes, self.data.blocks], device)
+        self.data.parents = wp.array(_block_parents(self.data.nodes, int(counts[3])), dtype=wp.int32, device=device)
         self._fill()
 
     def _fill(self) -> None:
@@ -212,6 +213,15 @@ class TriangleBvh:
         geometry = [self._positions, self._indices, self.data.face_masks]
         launch.launch(building.fill_blocks, len(blocks) // layout.BLOCK_WORDS, [*geometry, blocks, block_boxes], device)
         launch.launch(building.fill_nodes, 1, [nodes, block_boxes, node_boxes], device)
+
+
+def _block_parents(nodes: wp.array, block_count: int) -> np.ndarray:
+    """Return int32 [block]: where the node above each block starts, as children are written."""
+    children = nodes.numpy().view(np.int32).reshape(-1, layout.NODE_WORDS)[:, layout.NODE_WORDS - 8 :]
+    node, lane = np.nonzero(children < -1)
+    parents = np.zeros(block_count, np.int32)
+    parents[~children[node, lane] // layout.BLOCK_STEPS] = node * layout.NODE_STEPS
+    return parents
 
 
 def _make_mesh(points: wp.array, corners: np.ndarray, positions: np.ndarray) -> wp.Mesh:

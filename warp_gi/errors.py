@@ -18,6 +18,10 @@ class OptionError(GiError):
     """A setting or option is unknown or out of range."""
 
 
+class BakeError(GiError):
+    """A bake file is damaged, foreign, or of another scene or other settings."""
+
+
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> OptionError:
     """Return an error for an unknown ``name`` that lists the known ones and the nearest match."""
     known = sorted(known)

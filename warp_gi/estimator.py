@@ -1,4 +1,4 @@
-"""The protocol of an estimator: plain settings, and the three calls bake, preprocess, trace."""
+"""The protocol of an estimator: plain settings, and the calls bake, start, preprocess, trace."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from warp_gi.baking import Bake
+    from warp_gi.camera import Camera, CameraPath
     from warp_gi.scene.scene import Scene
     from warp_gi.scheduler import Frame
 
@@ -16,9 +18,9 @@ if TYPE_CHECKING:
 class Estimator:
     """Base of every estimator of one term of the light; a frozen dataclass of plain settings.
 
-    The scheduler calls ``bake`` once, ``preprocess`` once a frame and ``trace`` once for
-    each camera sample. ``state`` is whatever ``preprocess`` returned last (at first what
-    ``bake`` returned); an estimator keeps nothing anywhere else.
+    What can be known before the first frame is a ``Bake``, which can be saved; ``start`` makes
+    the first state of it, ``preprocess`` the state of each frame, and ``trace`` is called once for
+    each camera sample. An estimator keeps nothing anywhere but in its state.
     """
 
     term: ClassVar[str]
@@ -30,8 +32,33 @@ class Estimator:
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
 
-    def bake(self, scene: Scene, device: str, seed: int = 0, progress: Callable[[float], None] | None = None) -> Any:
-        """Return what can be known before the first frame, or None."""
+    def bake_key(self, scene: Scene) -> str:
+        """Return a hash of all in the scene that ``bake`` and the state depend on; "" is everything.
+
+        While it stays, a changed sky or light leaves bake and state as they are.
+        """
+        return ""
+
+    def bake_settings(self, scene: Scene) -> dict[str, Any]:
+        """Return the settings that a bake depends on."""
+        return {}
+
+    def bake(
+        self,
+        scene: Scene,
+        device: str,
+        seed: int = 0,
+        progress: Callable[[float], None] | None = None,
+        camera: Camera | CameraPath | None = None,
+    ) -> Bake | None:
+        """Return what can be known before the first frame, or None if there is nothing.
+
+        ``camera`` is where the scene will be seen from, for those that bake no more than that.
+        """
+        return None
+
+    def start(self, scene: Scene, device: str, bake: Bake | None, seed: int = 0) -> Any:
+        """Return the state before the first frame."""
         return None
 
     def preprocess(self, frame: Frame, state: Any) -> Any:

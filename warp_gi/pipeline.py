@@ -10,6 +10,7 @@ from typing import Any
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.techniques.baselines import BsdfPaths, PowerLights, TracedEnvironment, UniformLights
+from warp_gi.techniques.visibility_field import VisibilityField
 
 __all__ = ["PRESETS", "TERMS", "Estimator", "Pipeline"]
 
@@ -25,7 +26,7 @@ class Pipeline:
     Raises OptionError for settings that make no sense.
     """
 
-    environment: TracedEnvironment | None = TracedEnvironment()
+    environment: TracedEnvironment | VisibilityField | None = TracedEnvironment()
     """Direct light from the sky."""
     emitters: PowerLights | UniformLights | None = PowerLights()
     """Direct light from emissive triangles and punctual lights."""
@@ -99,5 +100,6 @@ class Pipeline:
 PRESETS: dict[str, dict[str, Any]] = {
     "path": {},
     "direct": {"indirect": None},
+    "dvf": {"environment": VisibilityField()},
 }
 """Fields of each named pipeline, where they differ from the defaults."""

@@ -15,7 +15,9 @@ import warp as wp
 import warp_gi
 from warp_gi import launch
 from warp_gi.camera import Camera, CameraPath
-from warp_gi.errors import OptionError, unknown_name
+from warp_gi.baking import Bake
+from warp_gi.errors import BakeError, OptionError, unknown_name
+from warp_gi.estimator import Estimator
 from warp_gi.kernels import compose, gbuffer, path_trace, types
 from warp_gi.pipeline import TERMS, Pipeline
 from warp_gi.scene.scene import Scene
@@ -114,6 +116,14 @@ class Frame:
         if paths is not None:
             self._paths = paths
 
+    def moments(self, name: str) -> tuple[wp.array, wp.array]:
+        """Return sums of an independent launch's samples and of their squares, which the variance buffer adds."""
+        if self._arrays.get(f"{name}_moment1") is None:
+            width, height = self.camera.resolution
+            for order in (1, 2):
+                self._arrays[f"{name}_moment{order}"] = wp.zeros(width * height, dtype=wp.vec3, device=self.device)
+        return self._arrays[f"{name}_moment1"], self._arrays[f"{name}_moment2"]
+
     def launch(self, kernel: wp.Kernel, inputs: list[Any], count: int | None = None) -> None:
         """Run a kernel over ``count`` items, or over every pixel."""
         width, height = self.camera.resolution
@@ -138,7 +148,7 @@ class Frame:
         """Return a kernel struct whose fields are the buffers of the same names."""
         filled = struct()
         for name in struct.vars:
-            setattr(filled, name, self._arrays[name])
+            setattr(filled, name, self._arrays.get(name))
         return filled
 
 
@@ -152,8 +162,9 @@ class FrameScheduler:
         device: "cpu", "cuda", "cuda:1".
         seed: Every random number follows from it, the frame, the pixel and the sample.
         progress: Called with (stage, share done in [0, 1]) while baking and tracing.
+        bakes: Bakes made before (``gi.bake``, ``gi.load_bake``), each for the estimator that it names.
 
-    Raises OptionError for a device that is not there.
+    Raises OptionError for a device that is not there, BakeError for a bake of another scene or other settings.
     """
 
     def __init__(
@@ -164,6 +175,7 @@ class FrameScheduler:
         device: str = "cpu",
         seed: int = 0,
         progress: Callable[[str, float], None] | None = None,
+        bakes: Iterable[Bake] = (),
     ) -> None:
         for what, value, kinds in (
             ("scene", scene, Scene),
@@ -185,7 +197,9 @@ class FrameScheduler:
             self._light_sampler = PowerLights()  # next-event estimation along paths needs a distribution anyway
         else:
             self._light_sampler = None
+        self._bakes = _bakes_by_term(bakes, self._estimators)
         self._states: dict[str, Any] = {}
+        self._keys: dict[str, str] = {}
         self._bake_seconds = 0.0
         self._baked_version = -1
         self._scene_hash = ""
@@ -193,20 +207,43 @@ class FrameScheduler:
     def bake(self) -> None:
         """Let every estimator compute what it can before the first frame; done by the first frame otherwise.
 
-        Done afresh, with all states dropped, when the scene got another environment or animation.
+        Done afresh when the scene got another environment or animation, for every estimator that depends on it:
+        the others keep their states.
         """
         if self._baked_version == self.scene.version:
             return
         started = time.perf_counter()
-        self._states.clear()
+        self._states.pop("lights", None)
         for term, estimator in self._estimators.items():
-            self._progress(f"bake {term}", 0.0)
-            self._states[term] = estimator.bake(
-                self.scene, str(self.device), self.seed, lambda share, term=term: self._progress(f"bake {term}", share)
-            )
+            key = estimator.bake_key(self.scene)
+            if key and self._keys.get(term) == key:
+                continue
+            self._states[term], self._keys[term] = self._start(term, estimator), key
         self._scene_hash = self.scene.hash
         self._bake_seconds = time.perf_counter() - started
         self._baked_version = self.scene.version
+
+    def _start(self, term: str, estimator: Any) -> Any:
+        """Return an estimator's state before the first frame, from a bake made before or now."""
+        device, bake = str(self.device), self._bakes.get(term)
+        if bake is None:
+            self._progress(f"bake {term}", 0.0)
+            told = lambda share: self._progress(f"bake {term}", share)  # noqa: E731
+            bake = estimator.bake(self.scene, device, self.seed, told, self.camera)
+        else:
+            settings = estimator.bake_settings(self.scene)
+            bake.check(type(estimator).__name__, estimator.bake_key(self.scene), settings, self.scene.name)
+        return estimator.start(self.scene, device, bake, self.seed)
+
+    def state(self, term: str) -> Any:
+        """Return the state of the estimator of a term, as the last frame left it.
+
+        Raises OptionError for a term without an estimator.
+        """
+        self.bake()
+        if term not in self._states:
+            raise unknown_name("term of this pipeline", term, self._states)
+        return self._states[term]
 
     def frame(self, index: int, previous_index: int | None = None) -> Frame:
         """Render frame ``index``; motion is towards frame ``previous_index`` (None: the frame before it, if any)."""
@@ -307,6 +344,7 @@ def render(
     seed: int = 0,
     skip: Container[int] = (),
     progress: Callable[[str, float], None] | None = None,
+    bakes: Iterable[Bake] = (),
 ) -> Iterator[Frame]:
     """Yield the frames of a sequence.
 
@@ -319,18 +357,61 @@ def render(
         seed: Every random number follows from it, the frame, the pixel and the sample.
         skip: Frames that need not be rendered, because they exist already.
         progress: Called with (stage, share done in [0, 1]).
+        bakes: Bakes made before (``gi.bake``, ``gi.load_bake``), each for the estimator that it names.
 
-    Raises OptionError for a device that is not there, a negative frame or seed.
+    Raises OptionError for a device that is not there, a negative frame or seed, BakeError for a bake of another
+    scene or other settings.
     """
     if frames is None:
         frames = range(camera.frame_count if isinstance(camera, CameraPath) else 1)
     frames = list(frames)
     if any(index < 0 for index in frames):
         raise OptionError(f"frame numbers must be 0 or above, got {min(frames)}")
-    scheduler = FrameScheduler(scene, camera, pipeline or Pipeline(), device, seed, progress)
+    scheduler = FrameScheduler(scene, camera, pipeline or Pipeline(), device, seed, progress, bakes)
     for position, index in enumerate(frames):
         if index not in skip:
             yield scheduler.frame(index, frames[position - 1] if position else None)
+
+
+def bake(
+    scene: Scene,
+    estimator: Estimator,
+    device: str = "cpu",
+    seed: int = 0,
+    camera_path: Camera | CameraPath | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Bake:
+    """Return what an estimator can know of a scene before the first frame, to be saved and used again.
+
+    Args:
+        scene: What will be rendered.
+        estimator: For example ``gi.VisibilityField(cell_size=0.5)``.
+        device: "cpu", "cuda", "cuda:1".
+        seed: Every random number follows from it.
+        camera_path: From where the scene will be seen, for estimators that bake no more than that; None is everywhere.
+        progress: Called with (stage, share done in [0, 1]).
+
+    Raises OptionError for a device that is not there, or an estimator that has nothing to bake.
+    """
+    told = (lambda share: progress("bake", share)) if progress else None
+    result = estimator.bake(scene, device, seed, told, camera_path)
+    if result is None:
+        raise OptionError(
+            f"{type(estimator).__name__} with these settings has nothing to bake; render with it as it is"
+        )
+    return result
+
+
+def _bakes_by_term(bakes: Iterable[Bake], estimators: dict[str, Estimator]) -> dict[str, Bake]:
+    """Return the bakes by the term whose estimator they are for; raises BakeError for one that nothing uses."""
+    terms = {type(estimator).__name__: term for term, estimator in estimators.items()}
+    found: dict[str, Bake] = {}
+    for one in bakes:
+        if one.technique not in terms:
+            names = ", ".join(sorted(terms)) or "none"
+            raise BakeError(f"a bake of {one.technique} was given, but the pipeline's estimators are: {names}")
+        found[terms[one.technique]] = one
+    return found
 
 
 def camera_data(camera: Camera) -> gbuffer.CameraData:

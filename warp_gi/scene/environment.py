@@ -27,6 +27,7 @@ from warp_gi.alias import AliasTable
 from warp_gi.errors import SceneError
 from warp_gi.kernels import types
 from warp_gi.launch import get_device, on_device
+from warp_gi.scene import harmonics
 from warp_gi.scene.model import Color
 from warp_gi.scene.sky import SunSky, node_solid_angles
 
@@ -53,6 +54,11 @@ class _Map:
         """float64 [3]: the radiance averaged over the sphere, exact for the bilinear map."""
         height, width = self.pixels.shape[:2]
         return self.pixels.sum(1, dtype=np.float64).T @ node_solid_angles(height, width) / (4 * math.pi)
+
+    @cached_property
+    def harmonics(self) -> np.ndarray:
+        """float64 [3, 9]: spherical harmonics in the map's own space."""
+        return harmonics.project(self.pixels)
 
     def on(self, device: wp.Device) -> tuple[wp.array, ...]:
         """Return texels and alias table on the device."""
@@ -144,6 +150,19 @@ class Environment:
         if self._map is not None:
             return self._map.mean * self.scale
         return np.array(self.color or (0.0, 0.0, 0.0)) * self.scale
+
+    @property
+    def harmonics(self) -> np.ndarray:
+        """float64 [3, 9]: its low frequencies in world space, W/(m^2 sr), a row each for red, green, blue.
+
+        Ordered as in ``kernels/harmonics.py``. Beside a sharp bright sun they swing below zero, as a sum of
+        nine smooth functions must.
+        """
+        if self._map is None:
+            result = np.zeros((3, 9))
+            result[:, 0] = self.mean_radiance * math.sqrt(4 * math.pi)
+            return result
+        return harmonics.rotate(self._map.harmonics, self.world_from_environment) * self.scale
 
     @property
     def content_hash(self) -> str:

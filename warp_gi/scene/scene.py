@@ -74,6 +74,7 @@ class Scene:
         self._bounds = self._all_bounds()
         self._devices: dict[str, _DeviceScene] = {}
         self._geometry_hash: str | None = None
+        self._contents_hash: str | None = None
 
     # ---- what is in it ----
 
@@ -173,18 +174,25 @@ class Scene:
     @property
     def hash(self) -> str:
         """sha256 of all that decides the pictures but the cameras; equal in every process."""
-        digest = hashlib.sha256(b"warp_gi scene 1" + self.geometry_hash.encode())
-        flat = self._flat
-        _update(digest, flat.normals, flat.uvs, flat.materials, flat.objects)
-        images = textures.distinct_textures(self.materials)
-        _update(digest, textures.material_table(self.materials, images))
-        for image in images:
-            _update(digest, repr((image.srgb, image.wrap)), image.pixels)
-        world = animation.world_matrices(self.nodes, 0.0)
-        _update(digest, emitters.emitter_table(self._emissive, self.lights, world))
-        _update(digest, repr([light.node for light in self.lights]))
+        digest = hashlib.sha256(self._hash_without_sky().encode())
         _update(digest, "no sky" if self._environment is None else self._environment.content_hash)
         return digest.hexdigest()
+
+    def _hash_without_sky(self) -> str:
+        """Hash of the rest, kept: a sky that changes from frame to frame must not cost a pass over all textures."""
+        if self._contents_hash is None:
+            digest = hashlib.sha256(b"warp_gi scene 1" + self.geometry_hash.encode())
+            flat = self._flat
+            _update(digest, flat.normals, flat.uvs, flat.materials, flat.objects)
+            images = textures.distinct_textures(self.materials)
+            _update(digest, textures.material_table(self.materials, images))
+            for image in images:
+                _update(digest, repr((image.srgb, image.wrap)), image.pixels)
+            world = animation.world_matrices(self.nodes, 0.0)
+            _update(digest, emitters.emitter_table(self._emissive, self.lights, world))
+            _update(digest, repr([light.node for light in self.lights]))
+            self._contents_hash = digest.hexdigest()
+        return self._contents_hash
 
     # ---- what moves ----
 
@@ -205,6 +213,21 @@ class Scene:
     def moves(self, index: int) -> bool:
         """Return whether node ``index``, or one above it, has keyframes."""
         return self._moving[index]
+
+    @property
+    def moving_objects(self) -> dict[int, int]:
+        """Node of each object (by object id) that can move."""
+        objects = [index for index, node in enumerate(self.nodes) if node.meshes]
+        return {number: index for number, index in enumerate(objects) if self._moving[index]}
+
+    def node_box(self, index: int, time: float) -> np.ndarray:
+        """Return a box around the meshes of node ``index`` at ``time`` [s]: low and high corner, float64 [2, 3]."""
+        matrix, corners = self.world_from_node(index, time), []
+        for mesh in self.nodes[index].meshes:
+            box = np.stack([mesh.points.min(axis=0), mesh.points.max(axis=0)]).astype(np.float64)
+            corners.append(np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(8, 3))
+        points = np.concatenate(corners) @ matrix[:3, :3].T + matrix[:3, 3]
+        return np.stack([points.min(axis=0), points.max(axis=0)])
 
     def world_from_node(self, index: int, time: float) -> np.ndarray:
         """Return the placement of node ``index`` at ``time`` [s], float64 [4, 4]."""
@@ -238,6 +261,11 @@ class Scene:
         """Return the TriangleBvh behind ``data(device)``."""
         self.data(device)
         return self._devices[_device(device).alias].bvh
+
+    def resting_bvh(self, device: str | wp.Device | None = None) -> Any:
+        """Return a TriangleBvh of what never moves; ``bvh`` itself if nothing does."""
+        self.data(device)
+        return self._devices[_device(device).alias].resting_bvh()
 
     def _all_bounds(self) -> np.ndarray:
         flat = self._flat
@@ -298,9 +326,23 @@ class _DeviceScene:
         data.radius = scene.radius
         masks = alpha_masks(flat, scene.materials, images, data.textures, data.texels)
         self.bvh = TriangleBvh(flat.points, flat.indices, device=device.alias, alpha=masks)
+        self._masks, self._resting_bvh = masks, None
         data.bvh = self.bvh.data
         self.data = data
         self.set_environment(scene.environment)
+
+    def resting_bvh(self) -> Any:
+        if not self.scene.is_animated:
+            return self.bvh
+        if self._resting_bvh is None:
+            from warp_gi.bvh import TriangleBvh
+
+            rests = ~np.isin(self.flat.objects, list(self.scene.moving_objects))
+            if not rests.any():
+                raise SceneError("everything in this scene moves; nothing can be baked")
+            masks = self._masks and replace(self._masks, face_mask=self._masks.face_mask[rests])
+            self._resting_bvh = TriangleBvh(self.flat.points, self.flat.indices[rests], self.device.alias, masks)
+        return self._resting_bvh
 
     def _array(self, values: np.ndarray, dtype: Any) -> wp.array:
         return on_device(values, dtype, self.device)

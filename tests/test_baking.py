@@ -1,0 +1,384 @@
+"""Bake files: what comes back, what is refused and why, whole or not at all."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from warp_gi import baking
+from warp_gi.baking import Bake, load_bake
+from warp_gi.errors import BakeError, GiError
+
+TYPES = "bool uint8 uint16 uint32 uint64 int8 int16 int32 int64 float16 float32 float64".split()
+SHAPES = [(), (0,), (0, 3), (1,), (7,), (5, 3), (2, 1, 3, 2)]
+KEY, OTHER_KEY = "ab12cd34ef56" + "0" * 52, "0123456789ab" + "f" * 52
+
+
+def make_bake(**changes):
+    arrays = {
+        "cells": np.arange(12, dtype=np.int32).reshape(4, 3),
+        "seen": np.array([True, False, True]),
+        "depth": np.linspace(0, 1, 5),
+        "area": np.ones(2),
+    }
+    values = {
+        "technique": "VisibilityField",
+        "scene_key": KEY,
+        "settings": {"directions": 36, "spacing": 0.5, "whole": 2.0, "mode": "cubes", "thin": True},
+        "arrays": arrays,
+        "counts": {"rays": 2**40, "seconds": 1.0},
+        "scene_name": "atrium",
+    }
+    return Bake(**(values | changes))
+
+
+def refused(path):
+    """Return the message of the BakeError that loading raises, less the path; it must be one line."""
+    with pytest.raises(BakeError) as caught:
+        load_bake(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ") and "\n" not in message
+    return message.removeprefix(f"{path}: ")
+
+
+def rewrite(path, change, seal=True):
+    """Let ``change`` edit the metadata of a bake file, in the file's own form."""
+    data = path.read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    fields = json.loads(data[8 : 8 + length])
+    metadata = fields["__metadata__"]
+    change(metadata)
+    if seal:
+        texts = {key: text for key, text in metadata.items() if key not in ("format", "metadata_sha256")}
+        metadata["metadata_sha256"] = baking._seal(texts)
+    header = json.dumps(fields, separators=(",", ":")).encode()
+    path.write_bytes(len(header).to_bytes(8, "little") + header + data[8 + length :])
+
+
+def test_bakes_come_back_bit_equal(tmp_path):
+    rng = np.random.default_rng(1)
+    arrays = {}
+    for name in TYPES:
+        for shape in SHAPES:
+            size = int(np.prod(shape)) * np.dtype(name).itemsize
+            values = rng.integers(0, 2 if name == "bool" else 256, size, dtype=np.uint8)  # NaN payloads too
+            arrays[f"{name}/{shape}"] = values.view(name).reshape(shape)
+    bake = make_bake(arrays=arrays)
+    path = bake.save(str(tmp_path / "new" / "folder" / "a.bake"))
+    assert path == tmp_path / "new" / "folder" / "a.bake"
+    assert os.listdir(path.parent) == ["a.bake"]
+    for back in (load_bake(path), Bake.load(str(path))):
+        assert (back.technique, back.scene_key, back.scene_name) == ("VisibilityField", KEY, "atrium")
+        assert back.settings == bake.settings and back.counts == bake.counts
+        for name, value in (bake.settings | bake.counts).items():
+            assert type((back.settings | back.counts)[name]) is type(value), name
+        assert back.arrays.keys() == arrays.keys()
+        for name, array in arrays.items():
+            assert back.arrays[name].dtype == array.dtype and back.arrays[name].shape == array.shape, name
+            assert back.arrays[name].tobytes() == array.tobytes(), name
+            assert back.arrays[name].flags.writeable and back.arrays[name].flags.c_contiguous, name
+        assert back.nbytes == bake.nbytes == sum(array.nbytes for array in arrays.values())
+    back.arrays["int32/(5, 3)"][2, 1] += 1  # into memory of its own
+    assert load_bake(path).arrays["int32/(5, 3)"].tobytes() == arrays["int32/(5, 3)"].tobytes()
+
+
+def test_other_layouts_come_back_by_value(tmp_path):
+    values = np.arange(24, dtype=np.float32).reshape(4, 6)
+    frozen = values.copy()
+    frozen.flags.writeable = False
+    arrays = {"columns": np.asfortranarray(values), "strided": values[::2, ::-3], "big": values.astype(">f4")}
+    arrays |= {"frozen": frozen, "repeated": np.broadcast_to(values[0], (3, 6))}
+    back = load_bake(make_bake(arrays=arrays).save(tmp_path / "a.bake"))
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(back.arrays[name], array, err_msg=name)
+        assert back.arrays[name].dtype == np.float32 and back.arrays[name].flags.writeable
+
+
+def test_bakes_of_nothing_come_back(tmp_path):
+    back = load_bake(Bake("Probes", "", {}, {}).save(tmp_path / "a.bake"))
+    assert (back.arrays, back.settings, back.counts, back.scene_name, back.nbytes) == ({}, {}, {}, "", 0)
+
+
+def test_numpy_scalars_become_plain_numbers(tmp_path):
+    bake = make_bake(settings={"a": np.float32(0.1), "b": np.int64(3), "c": np.bool_(True)}, counts={"n": np.int32(4)})
+    back = load_bake(bake.save(tmp_path / "a.bake"))
+    assert [type(value) for value in back.settings.values()] == [float, int, bool] and type(back.counts["n"]) is int
+    back.check(bake.technique, bake.scene_key, bake.settings)
+
+
+def test_any_name_of_a_scene_can_be_stored(tmp_path):
+    assert load_bake(make_bake(scene_name='Häuser "2"\n').save(tmp_path / "a.bake")).scene_name == 'Häuser "2"\n'
+    undecodable = os.fsdecode(b"hall\xff.glb")
+    assert load_bake(make_bake(scene_name=undecodable).save(tmp_path / "b.bake")).scene_name == "hall\\udcff.glb"
+
+
+def test_equal_bakes_write_equal_bytes(tmp_path):
+    first = make_bake().save(tmp_path / "a.bake").read_bytes()
+    other = make_bake()
+    other.arrays = dict(reversed(other.arrays.items()))
+    other.settings = dict(reversed(other.settings.items()))
+    assert other.save(tmp_path / "b.bake").read_bytes() == first
+    assert load_bake(tmp_path / "a.bake").save(tmp_path / "c.bake").read_bytes() == first
+    script = "import sys; from warp_gi.baking import load_bake; load_bake(sys.argv[1]).save(sys.argv[2])"
+    subprocess.run([sys.executable, "-c", script, tmp_path / "a.bake", tmp_path / "d.bake"], check=True)
+    assert (tmp_path / "d.bake").read_bytes() == first
+
+
+def test_files_are_safetensors_of_aligned_arrays(tmp_path):
+    from safetensors import safe_open
+    from safetensors.numpy import load_file
+
+    bake = make_bake()
+    path = bake.save(tmp_path / "a.bake")
+    for name, array in load_file(path).items():
+        np.testing.assert_array_equal(array, bake.arrays[name])
+    with safe_open(path, framework="np") as file:
+        metadata = file.metadata()
+    assert metadata["format"] == "warp_gi bake" and metadata["format_version"] == "1"
+    assert json.loads(metadata["settings"]) == bake.settings and json.loads(metadata["counts"]) == bake.counts
+    data = path.read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    assert length % 8 == 0
+    for name, entry in json.loads(data[8 : 8 + length]).items():
+        if name != "__metadata__":
+            assert entry["data_offsets"][0] % bake.arrays[name].itemsize == 0
+
+
+def test_truncated_files_are_refused(tmp_path):
+    path = make_bake().save(tmp_path / "a.bake")
+    data = path.read_bytes()
+    header = 8 + int.from_bytes(data[:8], "little")
+    path.write_bytes(b"")
+    assert refused(path).startswith("is empty")
+    for size in range(1, len(data)):
+        path.write_bytes(data[:size])
+        message = refused(path)
+        if size <= 8:
+            assert message.startswith(f"has only {size} bytes: truncated, or not")
+        elif size < header:
+            assert message.startswith("is truncated: "), size
+        else:
+            assert message.startswith(f"is truncated: {len(data) - size} bytes are missing"), size
+
+
+def test_any_changed_byte_is_found(tmp_path):
+    path = make_bake().save(tmp_path / "a.bake")
+    data = path.read_bytes()
+    header = 8 + int.from_bytes(data[:8], "little")
+    for position in range(len(data)):
+        for mask in (0x01, 0x20, 0xFF):
+            changed = bytearray(data)
+            changed[position] ^= mask
+            path.write_bytes(changed)
+            message = refused(path)
+            if position >= header:
+                assert message.startswith("is damaged: its arrays are not those that were written")
+    path.write_bytes(data + b"\0")
+    assert refused(path).startswith("is damaged")
+    path.write_bytes(data)
+    load_bake(path)
+
+
+@pytest.mark.parametrize(
+    "old, new",
+    [(b'"I32"', b'"F32"'), (b'"F64"', b'"C64"'), (b'"depth"', b'"dep\\u0000"'), (b"[5]", b"[1,5]")],
+)
+def test_changed_headers_are_found(tmp_path, old, new):
+    path = make_bake().save(tmp_path / "a.bake")
+    data = path.read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    header = data[8 : 8 + length].replace(old, new)
+    assert header != data[8 : 8 + length]
+    path.write_bytes(len(header).to_bytes(8, "little") + header + data[8 + length :])
+    assert refused(path).startswith("is damaged: its ")  # 0.4 does not know C64
+
+
+def test_types_that_numpy_lacks_are_refused(tmp_path):
+    path = make_bake(arrays={"half": np.ones(4, np.float16)}).save(tmp_path / "a.bake")
+    data = path.read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    header = data[8 : 8 + length].replace(b'"F16"', b'"BF16"')
+    path.write_bytes(len(header).to_bytes(8, "little") + header + data[8 + length :])
+    assert refused(path).startswith("is damaged: its arrays")
+
+
+FOREIGN = {
+    "random": np.random.default_rng(2).bytes(4096),
+    "png": b"\x89PNG\r\n\x1a\n" + bytes(100),
+    "text": b"# cameras of the hall\n" * 20,
+    "short text": b"hello, world\n",
+    "json": b'{"format": "warp_gi bake"}',
+    "zeros": bytes(64),
+    "nested": (50_000).to_bytes(8, "little") + b"[" * 50_000,
+    "list": (2).to_bytes(8, "little") + b"[]",
+    "glb": b"glTF\x02\x00\x00\x00" + bytes(60),
+    "zip": b"PK\x03\x04" + bytes(100),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_foreign_files_are_refused(tmp_path, name):
+    path = tmp_path / "a.bake"
+    path.write_bytes(FOREIGN[name])
+    assert refused(path).startswith("is not a warp_gi bake")
+
+
+@pytest.mark.parametrize("metadata", [None, {"format": "pt"}, {"settings": "{}"}])
+@pytest.mark.parametrize("lost", [0, 3])
+def test_safetensors_by_others_are_refused(tmp_path, metadata, lost):
+    from safetensors.numpy import save
+
+    data = save({"weights": np.ones(3)}, metadata)
+    path = tmp_path / "a.safetensors"
+    path.write_bytes(data[: len(data) - lost])
+    assert refused(path).startswith("is a safetensors file by another program, not a warp_gi bake")
+
+
+def test_missing_files_and_folders_are_refused(tmp_path):
+    assert refused(tmp_path / "none.bake").startswith("no such file")
+    assert refused(tmp_path).startswith("is a folder")
+    (tmp_path / "file").write_text("")
+    assert refused(tmp_path / "file" / "a.bake").startswith("no such file")
+
+
+@pytest.mark.parametrize("lost", [0, 3])
+def test_newer_formats_are_refused(tmp_path, lost):
+    path = make_bake().save(tmp_path / "a.bake")
+    rewrite(path, lambda metadata: metadata.update(format_version="2"))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size - lost])
+    message = refused(path)
+    assert message.startswith("is a bake of format version 2, ") and "reads 1;" in message
+
+
+@pytest.mark.parametrize("version", ["0", "-1", "two", "", "1.0", "9" * 5000])
+def test_other_format_versions_are_damage(tmp_path, version):
+    path = make_bake().save(tmp_path / "a.bake")
+    rewrite(path, lambda metadata: metadata.update(format_version=version))
+    assert refused(path).startswith("is damaged: its format version is ")
+
+
+def test_metadata_must_be_whole(tmp_path):
+    for key in [*baking._TEXTS, "metadata_sha256"]:
+        path = make_bake().save(tmp_path / "a.bake")
+        rewrite(path, lambda metadata, key=key: metadata.pop(key), seal=False)
+        assert refused(path).startswith("is damaged: its ")
+    for key, text in [("settings", "{"), ("counts", "[1]"), ("settings", "7"), ("counts", "[" * 100_000)]:
+        path = make_bake().save(tmp_path / "a.bake")
+        rewrite(path, lambda metadata, key=key, text=text: metadata.update({key: text}))
+        assert refused(path).startswith("is damaged: its settings or counts are unreadable")
+    path = make_bake().save(tmp_path / "a.bake")
+    rewrite(path, lambda metadata: metadata.update(scene_key=OTHER_KEY), seal=False)
+    assert refused(path).startswith("is damaged: its metadata are not those that were written")
+    rewrite(path, lambda metadata: metadata.update(format_version=2))  # not even text
+    assert refused(path).startswith("is a bake of format version 2")
+
+
+def unsuitable(bake, *arguments):
+    with pytest.raises(BakeError) as caught:
+        bake.check(*arguments)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_check_says_why():
+    bake = make_bake()
+    asked = dict(bake.settings)
+    bake.check("VisibilityField", KEY, asked)
+    bake.check("VisibilityField", KEY, asked, "another name of the same scene")
+    bake.check("VisibilityField", KEY, asked | {"spacing": np.float32(0.5), "whole": 2})
+
+    message = unsuitable(bake, "LightFieldProbes", OTHER_KEY, {})
+    assert "by 'VisibilityField', not by 'LightFieldProbes'" in message
+    assert unsuitable(bake, "VisibilityField", OTHER_KEY, {}, "hall\n2") == (
+        "this bake is of scene 'atrium' (geometry ab12cd34ef56), "
+        "not of 'hall\\n2' (geometry 0123456789ab): bake it again"
+    )
+    assert (
+        "is of an unnamed scene (geometry ab12cd34ef56), not of an unnamed scene (geometry 0123456789ab)"
+        in unsuitable(make_bake(scene_name=""), "VisibilityField", OTHER_KEY, {})
+    )
+
+    del asked["thin"]
+    asked |= {"directions": 18, "mode": "a\nb", "new": False}
+    assert unsuitable(bake, "VisibilityField", KEY, asked) == (
+        "this bake has other settings (directions: bake has 36, asked for 18; mode: bake has 'cubes', asked for "
+        "'a\\nb'; new: bake has none, asked for False; thin: bake has True, asked for none): "
+        "bake it again or ask for its own"
+    )
+
+
+def test_a_loaded_bake_passes_its_own_check(tmp_path):
+    bake = make_bake(settings={"x": 0.1 + 0.2, "y": 1e-320, "z": 2**70, "text": "ä"})
+    load_bake(bake.save(tmp_path / "a.bake")).check(bake.technique, bake.scene_key, bake.settings, bake.scene_name)
+
+
+@pytest.mark.parametrize(
+    "array", [np.ones(2, np.complex64), np.array(["a"]), np.array([None]), np.ones(2, "M8[s]"), np.ones(2, "i4,f4")]
+)
+def test_other_types_are_refused_on_saving(tmp_path, array):
+    with pytest.raises(TypeError, match=r"^array 'x' is .*; a bake holds bool, uint8, .*float64: convert it first$"):
+        make_bake(arrays={"x": array}).save(tmp_path / "a.bake")
+    assert os.listdir(tmp_path) == []
+
+
+def test_what_cannot_come_back_is_refused_on_saving(tmp_path):
+    for value in (float("nan"), float("inf"), np.float32("-inf")):
+        with pytest.raises(BakeError, match=r"^setting 'x' is (nan|-?inf); "):
+            make_bake(settings={"x": value}).save(tmp_path / "a.bake")
+        with pytest.raises(BakeError, match=r"^count 'x' is (nan|-?inf); "):
+            make_bake(counts={"x": value}).save(tmp_path / "a.bake")
+    for value in ((1, 2), None, [1], {"a": 1}, np.ones(2), 1j):
+        with pytest.raises(TypeError, match=r"^setting 'x' is a \w+; "):
+            make_bake(settings={"x": value}).save(tmp_path / "a.bake")
+    with pytest.raises(TypeError, match=r"^setting 3 is "):
+        make_bake(settings={3: 4}).save(tmp_path / "a.bake")
+    for name in ("__metadata__", "a\nb", "\udcff"):
+        with pytest.raises(BakeError, match=r"^array name .* cannot be stored"):
+            make_bake(arrays={name: np.ones(2)}).save(tmp_path / "a.bake")
+    assert os.listdir(tmp_path) == []
+    assert issubclass(BakeError, GiError)
+
+
+class FullDisk:
+    """A file that takes ``space`` bytes."""
+
+    def __init__(self, file, space):
+        self.file, self.space = file, space
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.file.close()
+
+    def write(self, data):
+        data = memoryview(data)
+        self.file.write(data[: self.space])
+        self.space -= data.nbytes
+        if self.space < 0:
+            raise OSError(28, "No space left on device")
+
+
+@pytest.mark.parametrize("space", [0, 100, 1700])
+def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch, space):
+    path = make_bake().save(tmp_path / "a.bake")
+    old = path.read_bytes()
+    larger = make_bake(arrays={"values": np.arange(1000)}, scene_name="hall")
+    monkeypatch.setattr(baking, "open", lambda *how: FullDisk(open(*how), space), raising=False)
+    for target in (path, tmp_path / "new.bake"):
+        with pytest.raises(OSError, match="No space left on device") as caught:
+            larger.save(target)
+        assert caught.value.errno == 28 and caught.value.filename == str(target)
+    monkeypatch.undo()
+    assert os.listdir(tmp_path) == ["a.bake"] and path.read_bytes() == old
+    larger.save(path)
+    assert load_bake(path).scene_name == "hall"
+
+
+def test_importing_does_not_need_safetensors():
+    script = "import sys, warp_gi.baking; print('safetensors' in sys.modules)"
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "False"
