@@ -3,10 +3,11 @@
 A cell holds two bits for each texel of an octahedral map: whether some surface sample in the cell saw the sky
 through the texel (the visibility mask, Eq. 5), and whether some sample found it occluded (the occlusion mask, Eq. 6).
 Eq. 1 and 2 say "all samples", but the OR of Eq. 5 and 6 is what makes a cleared bit a promise: a texel with one bit
-is surely visible or surely occluded, one with both is mixed, one with none was never looked at; the last two are traced.
+is surely visible or surely occluded, one with both is mixed, one with none was never looked at; the last two are
+traced.
 
-Rays come eight at a time, an octet: their directions, texels and bits are worked out in vectors of eight on the CPU, one
-by one on CUDA, from the same text.
+Rays come eight at a time, an octet: their directions, texels and bits are worked out in vectors of eight on the CPU,
+one by one on CUDA, from the same text.
 """
 
 import warp as wp
@@ -179,9 +180,9 @@ _END = """
 """
 
 
-# Eight cosine-weighted rays, from number `start` of the sets on, turned by `frame`: x, y and z of their directions, their
-# texels (as floats), and, as the bits of the last float, which are visible (bits 0 to 7), occluded (8 to 15), and
-# above the plane of `normal` (16 to 23).
+# Eight cosine-weighted rays, from number `start` of the sets on, turned by `frame`: x, y and z of their directions,
+# their texels (as floats), and, as the bits of the last float, which are visible (bits 0 to 7), occluded (8 to 15),
+# and above the plane of `normal` (16 to 23).
 @wp.func_native(
     _LANES
     + """
@@ -255,8 +256,8 @@ def cosine_octet(
 ) -> vec33: ...
 
 
-# Sums over the octet's rays in `bits` of the light of a low-frequency sky (rows of `sky`: nine coefficients each of red,
-# green and blue): radiance, then its squares.
+# Sums over the octet's rays in `bits` of the light of a low-frequency sky (rows of `sky`: nine coefficients each of
+# red, green and blue): radiance, then its squares.
 @wp.func_native(
     _LANES
     + """

@@ -23,11 +23,11 @@ from warp_gi.kernels.visibility_field import (
     VisibilityGrid,
     cell_of,
     cosine_octet,
+    hinted_occluded,
     lowest_bit,
     octet_bits,
     octet_direction,
     octet_texel,
-    hinted_occluded,
     turned_frame,
 )
 
@@ -430,18 +430,26 @@ def merge_masks(first: wp.int32, cells: MergeCells):
         cells.settled[start + word] = done
 
 
-# Thread: a pixel. The cell of what it sees, -1 for the sky.
+# Thread: a block of 2 x 2 pixels, of which it looks at number `corner`. The cell of what that pixel sees, -1 for none.
 @wp.kernel
 def find_cells(
-    first: wp.int32, scene: SceneData, camera: CameraData, grid: VisibilityGrid, cells: wp.array(dtype=wp.int32)
+    first: wp.int32,
+    scene: SceneData,
+    camera: CameraData,
+    corner: wp.int32,
+    grid: VisibilityGrid,
+    cells: wp.array(dtype=wp.int32),
 ):
-    p = tiled_pixel(first + wp.tid(), camera.width)
-    if p[0] >= camera.width or p[1] >= camera.height:
+    width = (camera.width + 1) / 2
+    p = tiled_pixel(first + wp.tid(), width)
+    x = 2 * p[0] + corner % 2
+    y = 2 * p[1] + corner / 2
+    if p[0] >= width or 2 * p[1] >= camera.height:
         return
-    direction = camera_ray(camera, wp.float32(p[0]) + 0.5, wp.float32(p[1]) + 0.5)
+    direction = camera_ray(camera, wp.float32(x) + 0.5, wp.float32(y) + 0.5)
     hit = bvh_intersect(scene.bvh, camera.position, direction, float(wp.inf))
     cell = int(-1)
     if hit.face >= 0:
         s = surface_shape(scene, hit.face, hit.u, hit.v, -direction)
         cell = cell_of(grid, ray_origin(s))
-    cells[p[1] * camera.width + p[0]] = cell
+    cells[p[1] * width + p[0]] = cell

@@ -70,6 +70,14 @@ class FieldSky:
     pdfs: wp.array(dtype=wp.float32)  # 1/sr; 0 if there is nothing to sample
 
 
+# All that a frame asks for its light.
+@wp.struct
+class Field:
+    grid: VisibilityGrid
+    query: FieldQuery
+    sky: FieldSky
+
+
 # Sums over samples, [height * width].
 @wp.struct
 class FieldBuffers:
@@ -103,8 +111,8 @@ class FieldSums:
     light_square: wp.vec3
 
 
-# What is known of a ray without tracing it: 1 visible, 0 occluded, -1 has to be traced. Glossy lobes of the paper's mode
-# are traced inside the visibility mask whatever the label says (its section 6).
+# What is known of a ray without tracing it: 1 visible, 0 occluded, -1 has to be traced. Glossy lobes of the paper's
+# mode are traced inside the visibility mask whatever the label says (its section 6).
 @wp.func
 def sure_visibility(
     grid: VisibilityGrid, query: FieldQuery, p: FieldPixel, texel: wp.int32, direction: wp.vec3
@@ -265,6 +273,8 @@ def lambert_samples(
                 todo = visible
             if subtracts:
                 todo = occluded
+                if (p.slot & SLOT_BOXED) != 0:
+                    todo = todo | boxed_lanes(query, p, octet, above & ~occluded)
             blocked = occluded_lanes(scene, p, octet, todo)
             if subtracts:
                 gone = blocked | (lanes & ~above)
@@ -383,12 +393,13 @@ def trace_field(
     scene: SceneData,
     camera: CameraData,
     settings: PassSettings,
-    grid: VisibilityGrid,
-    query: FieldQuery,
-    sky: FieldSky,
+    field: Field,
     hits: PrimaryHits,
     buffers: FieldBuffers,
 ):
+    grid = field.grid
+    query = field.query
+    sky = field.sky
     at = tiled_pixel(first + wp.tid(), camera.width)
     if at[0] >= camera.width or at[1] >= camera.height:
         return

@@ -14,8 +14,8 @@ import warp as wp
 
 import warp_gi
 from warp_gi import launch
-from warp_gi.camera import Camera, CameraPath
 from warp_gi.baking import Bake
+from warp_gi.camera import Camera, CameraPath
 from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.kernels import compose, gbuffer, path_trace, types

@@ -90,14 +90,14 @@ def neighbor_table(resolution: int, dilation: int) -> np.ndarray:
     i, j = np.meshgrid(np.arange(resolution), np.arange(resolution))
     dx, dy = (grid.reshape(-1) for grid in np.meshgrid(offsets, offsets))
     columns, rows = i.reshape(-1, 1) + dx, j.reshape(-1, 1) + dy
-    outside = (columns < 0) | (columns >= resolution)
-    rows = np.where(outside, resolution - 1 - rows, rows)
-    columns = np.where(
-        columns < 0, -1 - columns, np.where(columns >= resolution, 2 * resolution - 1 - columns, columns)
-    )
-    outside = (rows < 0) | (rows >= resolution)
-    columns = np.where(outside, resolution - 1 - columns, columns)
-    rows = np.where(rows < 0, -1 - rows, np.where(rows >= resolution, 2 * resolution - 1 - rows, rows))
+
+    def reflected(at: np.ndarray) -> np.ndarray:
+        return np.where(at < 0, -1 - at, np.where(at >= resolution, 2 * resolution - 1 - at, at))
+
+    rows = np.where(columns != reflected(columns), resolution - 1 - rows, rows)
+    columns = reflected(columns)
+    columns = np.where(rows != reflected(rows), resolution - 1 - columns, columns)
+    rows = reflected(rows)
     return (rows * resolution + columns).astype(np.int32)
 
 
@@ -216,7 +216,8 @@ class FieldBaker:
         masks, flags = np.empty((count, self.words), np.uint32), np.empty(count, np.int32)
         cumulative = np.append(0.0, np.cumsum(pieces.areas))
         areas = np.diff(cumulative[pieces.starts])
-        by_area = np.clip(np.ceil(self.density * areas), LEAST_SAMPLES, MOST_SAMPLES).astype(np.int64)
+        least = 1 if self.settings.samples else LEAST_SAMPLES
+        by_area = np.clip(np.ceil(self.density * areas), least, MOST_SAMPLES).astype(np.int64)
         edges = np.append(0, np.cumsum(pieces.edge_counts, dtype=np.int64))
         on_edges = np.minimum(np.diff(edges[pieces.starts]), by_area)
         samples = by_area + on_edges

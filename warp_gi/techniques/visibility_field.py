@@ -19,7 +19,7 @@ from warp_gi.kernels import harmonics as harmonics_kernels
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_trace as trace_kernels
 from warp_gi.techniques.visibility_bake import field_query, grid_of
-from warp_gi.techniques.visibility_state import RAYS_A_MILLISECOND, FieldState, cells_on_path
+from warp_gi.techniques.visibility_state import RAYS_A_MILLISECOND, FieldState, cells_on_path, corners_of
 
 _MODES = {
     "three_state": field_kernels.MODE_THREE_STATE,
@@ -149,7 +149,7 @@ class VisibilityField(Estimator):
         state.move(frame.time)
         most_rays = self.budget * RAYS_A_MILLISECOND
         if self.lazy and self.budget > 0:
-            cells = state.cells_in_view(frame.camera)
+            cells = state.cells_in_view(frame.camera, corners_of(frame.index))
             state.bake(cells, None, most_rays)
             if state.movers and state.rests:
                 state.bake_rest(cells, most_rays)
@@ -205,8 +205,10 @@ class VisibilityField(Estimator):
         buffers = trace_kernels.FieldBuffers()
         buffers.environment, buffers.transfer = frame["environment"], transfer
         buffers.moment1, buffers.moment2 = frame.moments("field")
-        inputs = [frame.data, frame.camera_data, frame.pass_settings, state.data, state.query, state.sky, frame.hits]
-        frame.launch_tiled(trace_kernels.trace_field, [*inputs, buffers])
+        field = trace_kernels.Field()
+        field.grid, field.query, field.sky = state.data, state.query, state.sky
+        inputs = [frame.data, frame.camera_data, frame.pass_settings, field, frame.hits, buffers]
+        frame.launch_tiled(trace_kernels.trace_field, inputs)
 
     def _relight_key(self, frame: Any, state: FieldState) -> tuple[Any, ...]:
         poses = b"".join(pose.tobytes() for pose in state.poses or ())
