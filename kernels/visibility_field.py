@@ -155,6 +155,7 @@ _LANES = """
     #define ROOT(x) sqrtf(x)
     #define AT(x, lane) (x)
     #define CONTRACT
+    #define COPY memcpy
 #else
     typedef float F __attribute__((vector_size(32)));
     typedef int I __attribute__((vector_size(32)));
@@ -165,6 +166,7 @@ _LANES = """
     #define TO_I(x) __builtin_convertvector(x, I)
     #define ROOT(x) __builtin_elementwise_sqrt(x)
     #define AT(x, lane) ((x)[lane])
+    #define COPY __builtin_memcpy
     #define CONTRACT _Pragma("clang fp contract(fast)")
 #endif
     #define ABS(x) ((x) < 0.0f ? -(x) : (x))
@@ -174,6 +176,7 @@ _END = """
     #undef TO_I
     #undef ROOT
     #undef AT
+    #undef COPY
     #undef CONTRACT
     #undef ABS
     ;
@@ -193,15 +196,15 @@ _END = """
     for (int lane = 0; lane < 8; lane += lanes) {
         CONTRACT
         F lx, ly, lz;
-        __builtin_memcpy(&lx, sets + lane, sizeof(F));
-        __builtin_memcpy(&ly, sets + rows + lane, sizeof(F));
-        __builtin_memcpy(&lz, sets + 2 * rows + lane, sizeof(F));
+        COPY(&lx, sets + lane, sizeof(F));
+        COPY(&ly, sets + rows + lane, sizeof(F));
+        COPY(&lz, sets + 2 * rows + lane, sizeof(F));
         const F x = frame.data[0][0] * lx + frame.data[0][1] * ly + frame.data[0][2] * lz;
         const F y = frame.data[1][0] * lx + frame.data[1][1] * ly + frame.data[1][2] * lz;
         const F z = frame.data[2][0] * lx + frame.data[2][1] * ly + frame.data[2][2] * lz;
-        __builtin_memcpy(&result.c[lane], &x, sizeof(F));
-        __builtin_memcpy(&result.c[8 + lane], &y, sizeof(F));
-        __builtin_memcpy(&result.c[16 + lane], &z, sizeof(F));
+        COPY(&result.c[lane], &x, sizeof(F));
+        COPY(&result.c[8 + lane], &y, sizeof(F));
+        COPY(&result.c[16 + lane], &z, sizeof(F));
         // octahedral_encode and octahedral_texel
         const float half = 0.5f * (float)grid.resolution;
         const F scale = half / (ABS(x) + ABS(y) + ABS(z));
@@ -217,7 +220,7 @@ _END = """
         j = j < 0 ? (j & 0) : j;
         const I texel = j * grid.resolution + i;
         const F number = TO_F(texel);
-        __builtin_memcpy(&result.c[24 + lane], &number, sizeof(F));
+        COPY(&result.c[24 + lane], &number, sizeof(F));
         const F height = x * normal[0] + y * normal[1] + z * normal[2];
 #if defined(__CUDA_ARCH__)
         above |= (unsigned)(height > 0.0f) << lane;
@@ -241,7 +244,7 @@ _END = """
         }
     }
     const unsigned bits = visible | occluded << 8 | above << 16;
-    __builtin_memcpy(&result.c[32], &bits, 4);
+    COPY(&result.c[32], &bits, 4);
     return result;
 """
     + _END
@@ -265,9 +268,9 @@ def cosine_octet(
     for (int lane = 0; lane < 8; lane += lanes) {
         CONTRACT
         F x, y, z;
-        __builtin_memcpy(&x, &octet.c[lane], sizeof(F));
-        __builtin_memcpy(&y, &octet.c[8 + lane], sizeof(F));
-        __builtin_memcpy(&z, &octet.c[16 + lane], sizeof(F));
+        COPY(&x, &octet.c[lane], sizeof(F));
+        COPY(&y, &octet.c[8 + lane], sizeof(F));
+        COPY(&z, &octet.c[16 + lane], sizeof(F));
 #if defined(__CUDA_ARCH__)
         const float keep = (float)((bits >> lane) & 1);
 #else

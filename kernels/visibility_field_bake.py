@@ -381,6 +381,7 @@ class MergeCells:
     resolution: wp.int32
     words: wp.int32
     flags: wp.array(dtype=wp.int32)  # [slot] SLOT_LABEL by Eq. 7 and 8
+    last: wp.int32  # 1 in the last round, after which nobody asks what is settled
 
 
 # Thread: a cell. ORs the chunks of a round into it, dilates, labels, and finds what is settled or quiet.
@@ -410,23 +411,31 @@ def merge_masks(first: wp.int32, cells: MergeCells):
         cells.flags[slot] = SLOT_LABEL
     else:
         cells.flags[slot] = 0
+    if cells.last != 0:
+        return
     for word in range(cells.words):
         done = wp.uint32(0)
         for i in range(wp.min(TEXELS_A_WORD, texels - word * TEXELS_A_WORD)):
             texel = word * TEXELS_A_WORD + i
-            state = wp.uint32(3)
-            for k in range(cells.neighbor_count):
-                state = state & state_in(cells.masks, start, cells.neighbors[texel * cells.neighbor_count + k])
-            quiet = wp.uint32(0)
-            for k in range(cells.quiet_count):
-                near = state_in(cells.masks, start, cells.quiet_neighbors[texel * cells.quiet_count + k])
-                if near == wp.uint32(0):
-                    near = wp.uint32(3)
-                quiet = quiet | near
-            if state == wp.uint32(3):
-                done = done | (wp.uint32(1) << wp.uint32(2 * i))
-            elif quiet == wp.uint32(1) or quiet == wp.uint32(2):
-                done = done | (wp.uint32(2) << wp.uint32(2 * i))
+            if state_in(cells.masks, start, texel) == wp.uint32(3):
+                settled = wp.uint32(1)
+                for k in range(cells.neighbor_count):
+                    near = state_in(cells.masks, start, cells.neighbors[texel * cells.neighbor_count + k])
+                    if near != wp.uint32(3):
+                        settled = wp.uint32(0)
+                        break
+                done = done | (settled << wp.uint32(2 * i))
+            else:
+                seen = wp.uint32(0)
+                for k in range(cells.quiet_count):
+                    near = state_in(cells.masks, start, cells.quiet_neighbors[texel * cells.quiet_count + k])
+                    if near == wp.uint32(0):
+                        near = wp.uint32(3)
+                    seen = seen | near
+                    if seen == wp.uint32(3):
+                        break
+                if seen != wp.uint32(3):
+                    done = done | (wp.uint32(2) << wp.uint32(2 * i))
         cells.settled[start + word] = done
 
 

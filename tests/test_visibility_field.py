@@ -194,7 +194,7 @@ def test_an_environment_that_turns_needs_no_bake(monkeypatch):
     turned = scheduler.frame(1).numpy("environment")
     assert scheduler.state("environment") is state and len(state.cells) == cells
     monkeypatch.undo()
-    fresh = list(gi.render(scene, path, pipeline(gi.VisibilityField(**SMALL)), frames=[1], device=st._device))[0]
+    fresh = next(gi.render(scene, path, pipeline(gi.VisibilityField(**SMALL)), frames=[1], device=st._device))
     assert np.array_equal(turned, fresh.numpy("environment"))
 
 
@@ -281,6 +281,7 @@ def test_a_bake_is_used_saved_and_refused(tmp_path):
     loaded = gi.load_bake(bake.save(tmp_path / "yard.dvf.safetensors"))
     scheduler = gi.FrameScheduler(scene, view(), pipeline(field), st._device, bakes=[loaded])
     assert np.array_equal(scheduler.frame(0).numpy("environment"), one(scene, field, spp=32)[0])
+    assert scheduler.metadata()["bake.environment"] == loaded.digest[:16]  # a resumed run tells bakes apart
     moved = courtyard()
     moved.nodes[1].meshes[0].points += 0.1
     other = gi.Scene(moved.nodes, environment=(1.0, 1.0, 1.0))

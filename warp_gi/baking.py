@@ -61,6 +61,11 @@ class Bake:
         """Size of all arrays, in bytes."""
         return sum(np.asarray(array).nbytes for array in self.arrays.values())
 
+    @property
+    def digest(self) -> str:
+        """SHA-256 over all arrays, hexadecimal."""
+        return _digest(self.arrays)
+
     def save(self, path: str | Path) -> Path:
         """Write the bake to ``path``, whole or not at all, and return the path; missing folders are made.
 

@@ -26,6 +26,7 @@ class Command:
 
 COMMANDS = {
     "render": Command("warp_gi.cli_render", "render a sequence of frames to EXR files, with PNG previews"),
+    "bake": Command("warp_gi.cli_bake", "compute once what an estimator needs, and save it"),
     "compare": Command("warp_gi.cli_compare", "measure how far a picture is from its reference"),
     "info": Command("warp_gi.cli_info", "print what a scene holds"),
     "bench": Command("warp_gi.cli_bench", "run a benchmark suite"),
@@ -42,6 +43,8 @@ examples:
   warp-gi render                                     the built-in atrium, with previews, to out/
   warp-gi render hall.glb --environment city.exr --frames 0-47 --spp 64 -o out/hall.####.exr
   warp-gi render hall.glb --resume ...               only the frames that are not there yet
+  warp-gi bake hall.glb --cell-size 0.5              once for all skies, to out/hall.dvf.safetensors;
+  warp-gi render hall.glb --pipeline dvf --bake out/hall.dvf.safetensors ...   uses it
   warp-gi compare out/hall.0000.exr reference.exr    RMSE, relMSE, PSNR, FLIP and a picture of the difference
 
 `warp-gi COMMAND --help` lists the options of a command. Errors are one line on stderr and exit code 2;

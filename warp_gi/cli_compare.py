@@ -16,7 +16,7 @@ from warp_gi.cli_report import print_table
 from warp_gi.errors import OptionError, SceneError
 from warp_gi.exr import read_exr, write_exr
 from warp_gi.files import replacing
-from warp_gi.preview import to_bytes, tone_map, write_png
+from warp_gi.preview import magma, tone_map, write_png
 
 
 @dataclass
@@ -113,14 +113,6 @@ def write_difference(
         write_png(path, np.concatenate(panels, axis=1))
     else:
         raise OptionError(f"cannot write {path.name}: the difference is a .png or an .exr file")
-
-
-def magma(values: np.ndarray) -> np.ndarray:
-    """Return values 0..1 [height, width] in the magma colours, uint8 [height, width, 3]: 0 is black, 1 pale yellow."""
-    import OpenImageIO as oiio
-
-    source = oiio.ImageBuf(np.ascontiguousarray(np.clip(values, 0, 1), np.float32)[:, :, None])
-    return to_bytes(oiio.ImageBufAlgo.color_map(source, 0, "magma").get_pixels(oiio.FLOAT)[:, :, :3])
 
 
 def _display(image: np.ndarray, exposure: float) -> np.ndarray:

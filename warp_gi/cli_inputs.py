@@ -4,24 +4,52 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+import tyro
 
 from warp_gi.camera import Camera, CameraPath
+from warp_gi.cli_options import flag
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.scene.builtin import BUILTIN_SCENES, builtin_camera_path, builtin_scene
-from warp_gi.scene.environment import Environment, as_environment
+from warp_gi.scene.environment import Environment, SunSky, as_environment
 from warp_gi.scene.loading import load_scene
 from warp_gi.scene.scene import Scene
 
 if TYPE_CHECKING:
-    from warp_gi.cli_render import Render
     from warp_gi.cli_report import Reporter
 
 DEFAULT_SCENE = "atrium"
+
+
+@dataclass
+class SceneOptions:
+    """What is looked at, under which sky, and from where."""
+
+    scene: Annotated[str, tyro.conf.Positional, flag("[SCENE]", DEFAULT_SCENE)] = ""
+    """A GLB, glTF, OBJ or PLY file, or the name of a built-in scene."""
+    smooth: Annotated[float | None, flag("DEGREES", "flat, as glTF asks")] = None
+    """Smooth normals for meshes of a file that have none, except across edges that bend more than this."""
+    scale: float = 1.0
+    """Metres in one unit of the file."""
+    environment: Annotated[str, flag("SKY", "the scene's own; files: none")] = ""
+    """The sky: a latitude-longitude EXR or HDR file, a radiance R,G,B, sun-sky, or none."""
+    environment_rotation: float = 0.0
+    """Turns the sky about +y, degrees, counter-clockwise seen from above."""
+    environment_scale: float = 1.0
+    """Multiplies the sky's radiance."""
+    sun: SunSky = field(default_factory=SunSky)
+    camera: Annotated[str, flag("PATH", "the built-in path, the file's first camera, or one that sees all")] = ""
+    """A camera path in JSON, the name of a camera in the scene, or of a built-in scene whose path to take."""
+    eye: Annotated[tuple[float, float, float] | None, flag("X Y Z", "use --camera")] = None
+    """Where a still camera stands, metres."""
+    target: Annotated[tuple[float, float, float] | None, flag("X Y Z", "use --camera")] = None
+    """What it looks at."""
+    hfov: Annotated[float | None, flag("DEGREES", "the camera's own; 65 with --eye")] = None
+    """Horizontal field of view of a still camera."""
 
 
 def open_scene(name: str, smooth: float | None = None, scale: float = 1.0) -> Scene:
@@ -35,7 +63,7 @@ def open_scene(name: str, smooth: float | None = None, scale: float = 1.0) -> Sc
     return load_scene(name, smooth=smooth, scale=scale)
 
 
-def find_scene(options: Render) -> Scene:
+def find_scene(options: SceneOptions) -> Scene:
     """Return the scene that was asked for, with its sky."""
     scene = open_scene(options.scene or DEFAULT_SCENE, options.smooth, options.scale)
     if options.environment:
@@ -45,7 +73,7 @@ def find_scene(options: Render) -> Scene:
     return scene
 
 
-def parse_environment(options: Render) -> Environment:
+def parse_environment(options: SceneOptions) -> Environment:
     """Return the sky that ``--environment`` names."""
     text = options.environment
     numbers = re.split(r"[,\s]+", text.strip())
@@ -65,7 +93,7 @@ def parse_environment(options: Render) -> Environment:
     return sky.rotated(options.environment_rotation)
 
 
-def find_camera(options: Render, scene: Scene, report: Reporter) -> Camera | CameraPath:
+def find_camera(options: SceneOptions, scene: Scene, report: Reporter) -> Camera | CameraPath:
     """Return the camera or path that was asked for."""
     if (options.eye is None) != (options.target is None):
         raise OptionError("--eye and --target go together; give both")

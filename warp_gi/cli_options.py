@@ -15,6 +15,11 @@ from warp_gi.errors import OptionError
 Options = TypeVar("Options")
 
 
+def flag(metavar: str, default: str, *aliases: str) -> object:
+    """Return how tyro shows a flag: what stands for its value, and its default in words."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})", aliases=aliases)
+
+
 def parse_options(options: type[Options], command: str, arguments: Sequence[str], **settings: Any) -> Options:
     """Return ``options`` filled from the command line; ``settings`` go to ``tyro.cli``.
 

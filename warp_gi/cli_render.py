@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -16,14 +16,16 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from warp_gi import launch
+from warp_gi.baking import load_bake
 from warp_gi.camera import Camera, CameraPath
-from warp_gi.cli_inputs import DEFAULT_SCENE, find_camera, find_scene, parse_resolution
-from warp_gi.cli_options import parse_options
+from warp_gi.cli_inputs import DEFAULT_SCENE, SceneOptions, find_camera, find_scene, parse_resolution
+from warp_gi.cli_options import flag, parse_options
 from warp_gi.cli_report import Reporter, start_warp
 from warp_gi.errors import OptionError, unknown_name
-from warp_gi.files import remove_stale_parts
+from warp_gi.files import check_writable, remove_stale_parts
 from warp_gi.pipeline import TERMS, Estimator, Pipeline
-from warp_gi.scene.environment import SunSky
+from warp_gi.scene.environment import Environment
+from warp_gi.scene.scene import Scene
 from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence import (
     frame_attributes,
@@ -35,11 +37,6 @@ from warp_gi.sequence import (
     write_preview,
 )
 
-
-def _flag(metavar: str, default: str, *aliases: str) -> object:
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})", aliases=aliases)
-
-
 DESCRIPTION = """Render a sequence of frames to EXR files with named layers, and PNG previews.
 
 Without SCENE, the built-in atrium along its camera path. Files appear whole or not at
@@ -48,45 +45,31 @@ all: stop with Ctrl-C or kill the process at any time, and carry on with --resum
   warp-gi render
   warp-gi render hall.glb --environment city.exr --camera path.json --frames 0-47 --spp 64
   warp-gi render hall.glb --eye 4 1.7 2 --target -3 1.6 -0.5 -o out/still.exr --preview
+  warp-gi render hall.glb --pipeline dvf --bake out/hall.dvf.safetensors --environment-turn 2
   warp-gi render cornell_box --pipeline path,emitters=UniformLights --indirect.max-depth 4"""
 
 
 @dataclass
-class Render:
+class Render(SceneOptions):
     """What to render, and how."""
 
-    scene: Annotated[str, tyro.conf.Positional, _flag("[SCENE]", f"{DEFAULT_SCENE}, with previews")] = ""
+    scene: Annotated[str, tyro.conf.Positional, flag("[SCENE]", f"{DEFAULT_SCENE}, with previews")] = ""
     """A GLB, glTF, OBJ or PLY file, or the name of a built-in scene."""
-    smooth: Annotated[float | None, _flag("DEGREES", "flat, as glTF asks")] = None
-    """Smooth normals for meshes of a file that have none, except across edges that bend more than this."""
-    scale: float = 1.0
-    """Metres in one unit of the file."""
-    pipeline: Annotated[str, _flag("NAME", "path")] = "path"
+    pipeline: Annotated[str, flag("NAME", "path")] = "path"
     """Preset, with estimators exchanged after commas: path,indirect=none. Its settings are the flags below."""
-    environment: Annotated[str, _flag("SKY", "the scene's own; files: none")] = ""
-    """The sky: a latitude-longitude EXR or HDR file, a radiance R,G,B, sun-sky, or none."""
-    environment_rotation: float = 0.0
-    """Turns the sky about +y, degrees, counter-clockwise seen from above."""
-    environment_scale: float = 1.0
-    """Multiplies the sky's radiance."""
-    sun: SunSky = field(default_factory=SunSky)
-    camera: Annotated[str, _flag("PATH", "the built-in path, the file's first camera, or one that sees all")] = ""
-    """A camera path in JSON, the name of a camera in the scene, or of a built-in scene whose path to take."""
-    eye: Annotated[tuple[float, float, float] | None, _flag("X Y Z", "use --camera")] = None
-    """Where a still camera stands, metres."""
-    target: Annotated[tuple[float, float, float] | None, _flag("X Y Z", "use --camera")] = None
-    """What it looks at."""
-    hfov: Annotated[float | None, _flag("DEGREES", "the camera's own; 65 with --eye")] = None
-    """Horizontal field of view of a still camera."""
-    frames: Annotated[str, _flag("LIST", "every frame of the path; 0 for a still camera")] = ""
+    bake: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction, flag("FILE", "none; may be given more than once")] = ()
+    """What warp-gi bake saved, for an estimator of the pipeline with the same settings."""
+    environment_turn: float = 0.0
+    """Degrees by which the sky turns from frame to frame, as --environment-rotation does."""
+    frames: Annotated[str, flag("LIST", "every frame of the path; 0 for a still camera")] = ""
     """Frame numbers: 5, 0-47, 0-47:2 or 1,4,9-12."""
-    resolution: Annotated[str, _flag("WxH", "the camera's own")] = ""
+    resolution: Annotated[str, flag("WxH", "the camera's own")] = ""
     """Width and height in pixels, as 960x540."""
     seed: int = 1
     """Every random number follows from it, the frame, the pixel and the sample."""
     device: str = "cpu"
     """cpu, cuda or cuda:1."""
-    threads: Annotated[int | None, _flag("N", "every core")] = None
+    threads: Annotated[int | None, flag("N", "every core")] = None
     """Threads on the CPU. The pictures do not depend on it."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = Path("out/shot.####.exr")
     """Where frames go; #### becomes the frame's number."""
@@ -180,6 +163,7 @@ def _subclasses(base: type) -> list[type]:
 def run(options: Render, report: Reporter) -> None:
     """Render what the options say."""
     resolution = parse_resolution(options.resolution) if options.resolution else None
+    bakes = [load_bake(path) for path in options.bake]
     with report.phase("scene"):
         scene = find_scene(options)
         camera = find_camera(options, scene, report)
@@ -187,10 +171,21 @@ def run(options: Render, report: Reporter) -> None:
         camera = camera.at_resolution(*resolution)
     report.line(f"{scene.name}: {scene.triangle_count:,} triangles, {scene.emitter_count:,} emitters")
     shots = plan(options, camera)
-    scheduler = FrameScheduler(scene, camera, options.settings, options.device, options.seed, report.stage)
+    sky = scene.environment
+    if not math.isfinite(options.environment_turn):
+        raise OptionError(f"--environment-turn must be a finite number of degrees, got {options.environment_turn:g}")
+    if options.environment_turn and sky is None:
+        raise OptionError(f"--environment-turn needs a sky to turn, and {scene.name} has none; give --environment too")
+    turn_sky(options, scene, sky, shots[0].index)
+    scheduler = FrameScheduler(scene, camera, options.settings, options.device, options.seed, report.stage, bakes)
     with report.phase("bake"):
         scheduler.bake()
-    todo = [shot for shot in shots if not options.resume or not is_done(options, shot, scheduler, report)]
+    todo = []
+    for shot in shots:
+        if options.resume:
+            turn_sky(options, scene, sky, shot.index)  # what the frame's file has to say
+        if not options.resume or not is_done(options, shot, scheduler, report):
+            todo.append(shot)
     if todo:
         check_writable(options.output.parent)
     if len(todo) < len(shots):
@@ -200,6 +195,7 @@ def run(options: Render, report: Reporter) -> None:
     try:
         with stoppable() as stop, report.bar(len(todo)):
             for shot in todo:
+                turn_sky(options, scene, sky, shot.index)
                 for stage, seconds in render_shot(options, shot, scheduler, report).items():
                     times.setdefault(stage, []).append(seconds)
                 if stop.is_set():
@@ -276,11 +272,12 @@ def plan(options: Render, camera: Camera | CameraPath) -> list[Shot]:
     ]
 
 
-def check_writable(folder: Path) -> None:
-    """Make the folder; raises OSError now, not after the first frame, if nothing can be written there."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryFile(dir=folder):
-        pass
+def turn_sky(options: Render, scene: Scene, sky: Environment | None, index: int) -> None:
+    """Give the scene the sky of frame ``index``; ``sky`` is that of frame 0."""
+    if options.environment_turn and sky is not None:
+        turned = sky.rotated(math.fmod(index * options.environment_turn, 360.0))
+        if scene.environment is None or turned.rotation != scene.environment.rotation:
+            scene.environment = turned
 
 
 def is_done(options: Render, shot: Shot, scheduler: FrameScheduler, report: Reporter) -> bool:

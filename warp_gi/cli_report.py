@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import warp as wp
 
 from warp_gi import launch
+
+LINE_SECONDS = 10.0
 
 
 class Reporter:
@@ -51,6 +53,30 @@ class Reporter:
                 yield
         else:
             yield
+        self.line(f"{name}: {time.perf_counter() - started:.1f} s")
+
+    @contextmanager
+    def shares(self, name: str) -> Iterator[Callable[[float], None]]:
+        """Yield what is told the share done of ``name``: a bar on a terminal, a line every 10 s or more elsewhere."""
+        started = told = time.perf_counter()
+        if self.terminal:
+            from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+            columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+            with Progress(*columns, transient=True) as shown:
+                task = shown.add_task(name, total=1.0)
+                yield lambda share: shown.update(task, completed=share)
+        else:
+
+            def tell(share: float) -> None:
+                nonlocal told
+                now = time.perf_counter()
+                if now - told > LINE_SECONDS and share < 1.0:
+                    left = f", {_clock((now - started) / share * (1.0 - share))} left" if share else ""
+                    self.line(f"{name} {share:.0%}{left}")
+                    told = now
+
+            yield tell
         self.line(f"{name}: {time.perf_counter() - started:.1f} s")
 
     @contextmanager

@@ -47,6 +47,14 @@ def to_bytes(values: np.ndarray) -> np.ndarray:
     return np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
 
 
+def magma(values: np.ndarray) -> np.ndarray:
+    """Return values 0..1 [height, width] in the magma colours, uint8 [height, width, 3]: 0 is black, 1 pale yellow."""
+    import OpenImageIO as oiio
+
+    source = oiio.ImageBuf(np.ascontiguousarray(np.clip(values, 0, 1), np.float32)[:, :, None])
+    return to_bytes(oiio.ImageBufAlgo.color_map(source, 0, "magma").get_pixels(oiio.FLOAT)[:, :, :3])
+
+
 def write_png(path: str | Path, pixels: np.ndarray) -> None:
     """Write uint8 [height, width, 3] as PNG; the file appears whole or not at all. Raises OSError."""
     from PIL import Image

@@ -198,6 +198,7 @@ class FrameScheduler:
         else:
             self._light_sampler = None
         self._bakes = _bakes_by_term(bakes, self._estimators)
+        self._bake_digests = {f"bake.{term}": bake.digest[:16] for term, bake in self._bakes.items()}
         self._states: dict[str, Any] = {}
         self._keys: dict[str, str] = {}
         self._bake_seconds = 0.0
@@ -296,6 +297,7 @@ class FrameScheduler:
             "scene_hash": self._scene_hash,
             "version": warp_gi.__version__,
             "device": self.device.name if self.device.is_cuda else "cpu",
+            **self._bake_digests,
             **{f"pipeline.{key}": value for key, value in self.pipeline.describe().items()},
         }
 

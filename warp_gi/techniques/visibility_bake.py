@@ -21,9 +21,9 @@ DEFAULT_CELLS = 77
 MOST_CELLS = 1 << 27
 """Of the grid, empty ones included: four bytes each."""
 CHUNK_SAMPLES = 32
-ROUND_ENDS = (64, 128, 256, 1 << 30)
+ROUND_ENDS = (64, 192, 1 << 30)
 """Samples of a cell after each round. What is settled by then is not traced in the next."""
-BATCH_BYTES = 1 << 26
+BATCH_BYTES = 1 << 24
 """Of the masks of chunks that are held at a time."""
 HINTS = 1 << 18
 BAKE_SETS = 16
@@ -61,14 +61,21 @@ def grid_of(bounds: np.ndarray, cell_size: float) -> Grid:
     low, high = bounds.astype(np.float64)
     size = float(cell_size) or float((high - low).max()) / DEFAULT_CELLS
     margin = 0.01 * size  # rays start a little off the outermost surfaces
-    counts = np.floor((high - low + 2 * margin) / size) + 1
-    if np.prod(counts) > MOST_CELLS:
-        least = size * (float(np.prod(counts)) / MOST_CELLS) ** (1 / 3)
+    counts = _cell_counts(high - low, size)
+    if not np.prod(counts) <= MOST_CELLS:
+        least = max(size, float((high - low).max()) / MOST_CELLS)
+        while np.prod(_cell_counts(high - low, least)) > MOST_CELLS:
+            least *= 1.05
         raise OptionError(
             f"cell_size {size:g} m makes a grid of {np.prod(counts):.3g} cells over this scene, at most {MOST_CELLS:,} "
-            f"are supported; use {least * 1.05:.3g} m or more"
+            f"are supported; use {least * 1.01:.3g} m or more"
         )
     return Grid(low - margin, size, tuple(int(n) for n in counts))
+
+
+def _cell_counts(extent: np.ndarray, size: float) -> np.ndarray:
+    """Return float64 [3]: cells along each axis; 1e100 where there are more."""
+    return np.floor(np.minimum(extent, 1e100 * size) / size + 0.02) + 1
 
 
 def field_query(device: wp.Device, set_size: int, set_count: int, seed: int, hints: int = 0) -> Any:
@@ -291,6 +298,7 @@ class FieldBaker:
             launch.launch(bake_kernels.bake_masks, total, inputs, device, smallest_slice=1)
             merge.chunk_start = wp.array(chunk_start, dtype=wp.int32, device=device)
             merge.partial = chunks.partial
+            merge.last = int(last >= samples.max())
             launch.launch(bake_kernels.merge_masks, count, [merge], device, smallest_slice=16)
             self.rays_traced += int(chunks.traced.numpy().sum(dtype=np.int64))
             self.rays_asked += int((round_ends - round_begins).sum()) * self.rays

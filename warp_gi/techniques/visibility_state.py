@@ -76,7 +76,8 @@ class FieldState:
             masks, empty = bake.arrays["masks"], bake.arrays["empty_cells"]
         except KeyError as missing:
             raise BakeError(f"this bake of a visibility field has no array {missing}; bake it again") from None
-        in_grid = ((cells >= 0) & (cells < state.grid.cell_count)).all() and len(np.unique(cells)) == len(cells)
+        named = np.concatenate([cells, empty])
+        in_grid = ((named >= 0) & (named < state.grid.cell_count)).all() and len(np.unique(cells)) == len(cells)
         if masks.shape != (len(cells), state.words) or flags.shape != cells.shape or not in_grid:
             raise BakeError(
                 f"this bake of a visibility field holds masks {masks.shape} for {len(cells)} cells of a grid of "

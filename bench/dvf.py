@@ -1,0 +1,150 @@
+"""Visibility fields: tracing the sky's light with and without them, what settings do, equal error, bakes.
+
+``python -m warp_gi.bench.dvf [--quick]``. Field and baseline (``mode="traced"``) are one kernel with the same rays, so
+a ratio is what the field saves and a difference of their pictures is its error. Seconds are of the sky light's stage
+alone, primary rays apart, except where a row says otherwise. What the paper measured stands in columns of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from warp_gi.bench import dvf_peers, runner
+from warp_gi.bench.dvf_views import PLACES, Place, Row, Stage, View, glossy, quality, race, rmse
+
+SPP = 64
+CARD = "RTX 3080"
+PAPER = {"mode": "paper", "sky": "harmonics", "resolution": 18, "rays": 128, "dilation": 1, "samples": 10_000_000}
+"""What the paper bakes and does."""
+PAPER_MS = {16: (6.69, 2.23), 32: (13.79, 4.02), 64: (27.28, 7.81), 128: (55.19, 15.74)}
+"""Sponza at 1920x1080, its table 1: milliseconds of a frame without and with the field."""
+PAPER_GLOSSY_MS = {"Sponza": (54.64, 10.14), "Bistro": (48.75, 27.16)}
+"""Its section 6 and figure 10."""
+PAPER_KB = {"Sponza": 49_008, "Bistro": 173_958}
+"""Of its dense fields, with cells of 0.5 and 1 m."""
+MODES: dict[str, dict[str, Any]] = {
+    "three_state": {"mode": "three_state"},
+    "paper": {"mode": "paper", "sky": "harmonics"},
+    "unbiased": {"mode": "unbiased"},
+}
+
+
+def run(quick: bool = False, device: str = "cpu") -> list[Row]:
+    """Return rows of all tables; ``quick`` takes a quarter of the pixels and two values of each setting."""
+    rows: list[Row] = []
+    for place in PLACES:
+        rows += place_rows(place, quick, device)
+    rows += dvf_peers.equal_error_rows(quick, device)
+    rows += dvf_peers.bake_rows(quick, device)
+    return rows + dvf_peers.relight_rows(quick, device)
+
+
+def place_rows(place: Place, quick: bool, device: str) -> list[Row]:
+    """Return what is measured on one scene; the sweeps are Sponza's."""
+    if place.missing:
+        return [{"table": "modes", "case": place.name, "skipped": place.missing}]
+    camera = place.camera().at_resolution(*((240, 135) if quick else (480, 270)))
+    view, repetitions = View(place.scene(), camera, device, **place.settings), 3 if quick else 7
+    rows = mode_rows(place.name, view, repetitions, place.target)
+    if place.name in PAPER_KB:
+        rows += sample_count_rows(place.name, view, repetitions, quick)
+        rows += glossy_rows(place.name, view, repetitions)
+    if place.name == "Sponza":
+        rows += sweep_rows(view, repetitions, quick)
+    return rows
+
+
+def _faster(times: dict[str, tuple[float, float]], name: str) -> Row:
+    (wall, cpu), (base_wall, base_cpu) = times[name], times["traced"]
+    return {"wall s": wall, "cpu s": cpu, "ratio wall": base_wall / wall, "ratio cpu": base_cpu / cpu}
+
+
+def mode_rows(name: str, view: View, repetitions: int, target: float) -> list[Row]:
+    """Return a row for each mode at 64 samples a pixel, and one for all as in the paper."""
+    stages: dict[str, Stage] = {"traced": view.stage(SPP, mode="traced")}
+    stages |= {mode: view.stage(SPP, **settings) for mode, settings in MODES.items()}
+    stages["paper, its settings"] = view.stage(SPP, **PAPER)
+    times = race(stages, repetitions)
+    rows: list[Row] = []
+    for mode, stage in stages.items():
+        if mode != "traced":
+            row = {"table": "modes", "case": name, "mode": mode, "traced s": times["traced"][1]} | _faster(times, mode)
+            rows.append(row | {"target": target} | quality(stage, stages["traced"]))
+    return rows
+
+
+def sample_count_rows(name: str, view: View, repetitions: int, quick: bool) -> list[Row]:
+    """Return table 1: seconds with and without the field by samples a pixel, with our defaults and the paper's."""
+    rows: list[Row] = []
+    for spp in (16, 64) if quick else PAPER_MS:
+        stages = {"traced": view.stage(spp, mode="traced"), "field": view.stage(spp)}
+        stages["paper, its settings"] = view.stage(spp, **PAPER)
+        times = race(stages, repetitions)
+        row: Row = {"table": "table 1", "case": name, "spp": spp}
+        row |= {"without wall s": times["traced"][0], "without cpu s": times["traced"][1]} | _faster(times, "field")
+        row["RMSE"] = rmse(stages["field"].picture, stages["traced"].picture)
+        row["paper's method, ratio cpu"] = times["traced"][1] / times["paper, its settings"][1]
+        rows.append(row)
+        if name == "Sponza":
+            without, with_ = PAPER_MS[spp]
+            paper: Row = {"table": f"table 1: paper, {CARD}", "case": f"{name} 1920x1080", "spp": spp}
+            rows.append(paper | {"without ms": without, "with ms": with_, "paper ratio": without / with_})
+    return rows
+
+
+def glossy_rows(name: str, view: View, repetitions: int) -> list[Row]:
+    """Return figure 10: the scene with every surface coated, in two modes, and what the paper says of it."""
+    shiny, rows = view.with_scene(glossy(view.scene)), []
+    stages = {"traced": shiny.stage(SPP, mode="traced")}
+    stages |= {mode: shiny.stage(SPP, **MODES[mode]) for mode in ("three_state", "paper")}
+    times = race(stages, repetitions)
+    for mode in ("three_state", "paper"):
+        row = {"table": "glossy", "case": name, "mode": mode, "traced s": times["traced"][1]} | _faster(times, mode)
+        rows.append(row | {"RMSE": rmse(stages[mode].picture, stages["traced"].picture)})
+    without, with_ = PAPER_GLOSSY_MS[name]
+    paper: Row = {"table": f"glossy: paper, {CARD}", "case": f"{name} 1920x1080", "without ms": without}
+    return [*rows, paper | {"with ms": with_, "paper ratio": without / with_}]
+
+
+def sweep_rows(view: View, repetitions: int, quick: bool, spp: int = SPP) -> list[Row]:
+    """Return a row for each value of the settings that the paper varies, and of the resolution of the masks."""
+    numbers = (80_000, 400_000, 2_000_000, 10_000_000, 0)
+    sizes, resolutions = (0.5, 1.0, 2.0, 4.0), (36, 48, 72, 96)
+    if quick:
+        numbers, sizes, resolutions = (80_000, 0), (1.0, 4.0), (72,)
+    sweeps: list[tuple[str, str, dict[str, Any]]] = [
+        ("samples", f"{number:,}" if number else "automatic", {"samples": number}) for number in numbers
+    ]
+    sweeps += [("cell size", f"{size:g} m", {"cell_size": size}) for size in sizes]
+    sweeps.append(("resolution", "18, 128 rays", {"resolution": 18, "rays": 128, "dilation": 1}))
+    sweeps += [("resolution", f"{resolution}", {"resolution": resolution}) for resolution in resolutions]
+    traced, rows = view.stage(spp, mode="traced"), []
+    for what, value, settings in sweeps:
+        stage = view.stage(spp, **settings)
+        bake, (wall, cpu) = view.bake(stage.estimator)
+        row: Row = {"table": f"Sponza by {what}", what: value}
+        row |= {"bake wall s": wall, "bake cpu s": cpu, "bake samples": bake.counts["samples"]}
+        row |= {"cells": len(stage.state.cells), "MB": stage.memory / 1e6}
+        row["MB of all cells"] = view.scene_memory(stage) / 1e6
+        times = race({"traced": traced, "field": stage}, repetitions)
+        rows.append(row | _faster(times, "field") | quality(stage, traced))
+    paper = [
+        {"table": f"memory: paper, {CARD}", "case": name, "paper MB": kb * 1024e-6} for name, kb in PAPER_KB.items()
+    ]
+    return rows + paper
+
+
+def main() -> None:
+    """Print the rows, as tables and as lines of JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="a quarter of the pixels, two values of each setting")
+    parser.add_argument("--device", default="cpu")
+    options = parser.parse_args()
+    rows = run(options.quick, options.device)
+    runner.print_rows("dvf", rows)
+    print(runner.json_lines("dvf", rows, options.quick, options.device), end="")
+
+
+if __name__ == "__main__":
+    main()

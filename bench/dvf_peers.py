@@ -1,0 +1,255 @@
+"""Visibility fields beside Mitsuba at equal error, beside raw rays when they bake, and relighting a still camera."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import warp_gi as gi
+from warp_gi import launch
+from warp_gi.bench import path, presets, rays
+from warp_gi.bench.dvf_views import PLACES, WHITE, Place, Row, timed_bake
+from warp_gi.bench.mitsuba_peer import PeerMissing, load_mitsuba, to_mitsuba
+from warp_gi.bvh import TriangleBvh
+from warp_gi.scene import harmonics
+
+SPP = 64
+RMSE = 0.01
+TARGETS = "4 / 2.5 / 1.8"
+EQUAL_ERROR_PLACES = ("Sponza", "atrium", "street")
+OURS: dict[str, Any] = {
+    "field, map": gi.VisibilityField(),
+    "field, harmonics": gi.VisibilityField(sky="harmonics"),
+    "traced": gi.TracedEnvironment(),
+}
+MITSUBA = {
+    "mitsuba, both": {"type": "direct", "bsdf_samples": 1, "emitter_samples": 1},
+    "mitsuba, emitter": {"type": "direct", "bsdf_samples": 0, "emitter_samples": 1},
+}
+_COURTYARD = "environments/courtyard.exr"
+_NAVE = (
+    gi.CameraKey(0.0, (-11.0, 1.5, -0.3), (5.0, 4.0, 0.0)),
+    gi.CameraKey(1.0, (-1.0, 1.8, 0.0), (15.0, 4.0, 0.0)),
+    gi.CameraKey(2.0, (9.0, 2.0, 0.3), (25.0, 4.0, 0.0)),
+)
+
+
+# ---- equal error ----
+
+
+def smooth_sky(height: int = 64) -> gi.Environment:
+    """Return a map of nine harmonics, of mean radiance 1 and nowhere below 0.1."""
+    theta = np.arange(height) * np.pi / (height - 1)
+    theta, phi = np.meshgrid(theta, (np.arange(2 * height) + 0.5) * np.pi / height, indexing="ij")
+    directions = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=-1)
+    coefficients = np.zeros((3, 9))
+    coefficients[:, 0] = np.sqrt(4 * np.pi)
+    coefficients[:, 1:] = [0.7, 0.3, 0.5, 0.1, -0.1, 0.2, 0.15, 0.1]
+    coefficients[:, 1] *= [0.8, 1.0, 1.2]
+    return gi.Environment(pixels=harmonics.basis(directions) @ coefficients.T, name="nine harmonics")
+
+
+def sharp_sky() -> gi.Environment:
+    """Return the courtyard, scaled to mean radiance 1."""
+    sky = gi.Environment.load(presets.SCENES / _COURTYARD)
+    return replace(sky, scale=1.0 / float(sky.mean_radiance.mean()))
+
+
+def equal_error_rows(quick: bool, device: str) -> list[Row]:
+    """Return rows of all renderers under a low-frequency sky and an all-frequency one."""
+    rows: list[Row] = []
+    size = (240, 135) if quick else (480, 270)
+    skies: dict[str, Callable[[], gi.Environment]] = {"low-frequency": smooth_sky, "courtyard": sharp_sky}
+    for place in (p for p in PLACES if p.name in EQUAL_ERROR_PLACES[: 1 if quick else None]):
+        for name, sky in skies.items():
+            if place.missing or (name == "courtyard" and not (presets.SCENES / _COURTYARD).exists()):
+                why = place.missing or f"no {presets.SCENES / _COURTYARD}; set WARP_GI_SCENES"
+                rows.append({"table": "equal error", "case": place.name, "sky": name, "skipped": why})
+                continue
+            scene = presets.peer_scene(place.scene(), diffuse=True, masks=False, emission=False)
+            scene = gi.Scene(scene.nodes, [], sky(), scene.cameras, scene.name)
+            rows += equal_error(place, scene, name, place.camera().at_resolution(*size), device)
+    return rows
+
+
+def equal_error(
+    place: Place, scene: gi.Scene, sky: str, camera: gi.Camera, device: str = "cpu", with_mitsuba: bool = True
+) -> list[Row]:
+    """Return a row for each renderer: seconds of whole frames, scatter, and what an RMSE of 0.01 would take.
+
+    The harmonics are another sky than an all-frequency one, so they only take part under the low-frequency one.
+    """
+    renderers: dict[str, Callable[[int], np.ndarray]] = {}
+    rows: list[Row] = []
+    for name, estimator in OURS.items():
+        if name != "field, harmonics" or sky == "low-frequency":
+            if isinstance(estimator, gi.VisibilityField):
+                estimator = replace(estimator, **place.settings)
+            renderers[name] = _ours(scene, camera, estimator, device)
+    if with_mitsuba:
+        try:
+            mi = load_mitsuba()
+            peer = to_mitsuba(scene, camera)
+            for name, integrator in MITSUBA.items():
+                renderers[name] = _theirs(mi, peer, mi.load_dict(integrator))
+        except PeerMissing as missing:
+            rows.append({"table": "equal error", "case": place.name, "sky": sky, "skipped": str(missing)})
+    times, images = path.measure(renderers)
+    scatter = {name: float(np.sqrt(np.mean(np.var(images[name], axis=0, ddof=1)))) for name in renderers}
+    factors = {name: (scatter[name] / RMSE) ** 2 for name in renderers}
+    best = min((times[name][1] * factors[name] for name in renderers if name in MITSUBA), default=None)
+    best_wall = min((times[name][0] * factors[name] for name in renderers if name in MITSUBA), default=None)
+    for name in renderers:
+        wall, cpu = times[name]
+        row: Row = {"table": "equal error", "case": place.name, "sky": sky, "renderer": name, "wall s": wall}
+        row |= {"cpu s": cpu, "RMSE": scatter[name]}
+        row |= {f"wall s to {RMSE}": wall * factors[name], f"cpu s to {RMSE}": cpu * factors[name]}
+        if best is not None and best_wall is not None:
+            row["times mitsuba, wall"] = best_wall / row[f"wall s to {RMSE}"]
+            row["times mitsuba, cpu"] = best / row[f"cpu s to {RMSE}"]
+            row["targets"] = TARGETS
+        row["mean / traced"] = float(np.mean(images[name]) / np.mean(images["traced"]))
+        rows.append(row)
+    return rows
+
+
+def _ours(scene: gi.Scene, camera: gi.Camera, estimator: Any, device: str) -> Callable[[int], np.ndarray]:
+    settings = {"emitters": None, "indirect": None, "spp": SPP, "camera_samples": path.CAMERA_SAMPLES}
+    pipeline = gi.Pipeline(environment=estimator, **settings)
+    scheduler = gi.FrameScheduler(scene, gi.CameraPath.still(camera), pipeline, device)
+    return lambda index: scheduler.frame(index).numpy("beauty").copy()
+
+
+def _theirs(mi: Any, peer: Any, integrator: Any) -> Callable[[int], np.ndarray]:
+    return lambda index: np.array(mi.render(peer, integrator=integrator, spp=SPP, seed=index))
+
+
+# ---- bakes ----
+
+
+def bake_rows(quick: bool, device: str) -> list[Row]:
+    """Return the rate of the bake's rays beside raw any-hit rays, and what a flight through Sponza needs."""
+    place = PLACES[0]
+    if place.missing:
+        return [{"table": "bake rate", "case": place.name, "skipped": place.missing}]
+    size = (240, 135) if quick else (480, 270)
+    rate = bake_rate(
+        place.name, place.scene(), place.camera().at_resolution(*size), device, 200_000 if quick else 1_000_000
+    )
+    flight = flight_bake((240, 135) if quick else (960, 540), 8 if quick else 48, device)
+    return [rate, flight]
+
+
+def bake_rate(
+    name: str,
+    scene: gi.Scene,
+    camera: gi.Camera,
+    device: str,
+    count: int,
+    field: gi.VisibilityField = OURS["field, map"],
+) -> Row:
+    """Return million rays a second of a view's bake and of ``count`` cosine-distributed any-hit rays."""
+    geometry = scene.data(device).geometry
+    points, indices = geometry.points.numpy(), geometry.indices.numpy().reshape(-1, 3)
+    tree = TriangleBvh(points, indices, device)
+    origins, directions = rays.diffuse_rays(points, indices, count)
+    tree.occluded(origins, directions)
+    taken = []
+    for _ in range(3):
+        wall, cpu = time.perf_counter(), time.process_time()
+        tree.occluded(origins, directions).numpy()
+        taken.append((time.perf_counter() - wall, time.process_time() - cpu))
+    raw_wall, raw_cpu = np.median(taken, axis=0)
+    timed_bake(scene, replace(field, samples=1), device, camera.at_resolution(16, 9))  # compiles
+    bake, (wall, cpu) = timed_bake(scene, field, device, camera)
+    traced = bake.counts["rays_traced"]
+    row: Row = {"table": "bake rate", "case": name, "threads": launch.thread_count(), "cells": bake.counts["cells"]}
+    row |= {"rays asked": bake.counts["rays"], "rays traced": traced, "wall s": wall, "cpu s": cpu}
+    row |= {"Mrays/wall s": traced / wall / 1e6, "raw Mrays/wall s": count / float(raw_wall) / 1e6}
+    row |= {"Mrays/cpu s": traced / max(cpu, 1e-9) / 1e6, "raw Mrays/cpu s": count / float(raw_cpu) / 1e6}
+    return row | {"bake / raw, cpu": row["Mrays/cpu s"] / row["raw Mrays/cpu s"]}
+
+
+def flight_bake(size: tuple[int, int], frames: int, device: str) -> Row:
+    """Return seconds, cells, memory and file size of the lazy bake of a flight through Sponza, in its own process."""
+    arguments = [sys.executable, "-m", "warp_gi.bench.dvf_peers", "--child", *map(str, (*size, frames)), device]
+    done = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    row: Row = {"table": "flight bake", "case": "Sponza", "pixels": f"{size[0]}x{size[1]}", "frames": frames}
+    if done.returncode:
+        return row | {"failed": (done.stderr.strip().splitlines() or ["no message"])[-1]}
+    return row | json.loads(done.stdout.strip().splitlines()[-1])
+
+
+def flight(size: tuple[int, int], frames: int) -> gi.CameraPath:
+    """Return the path along Sponza's nave in so many frames."""
+    return gi.CameraPath(_NAVE, fps=(frames - 1) / _NAVE[-1].time, resolution=size)
+
+
+def _child_main(width: str, height: str, frames: str, device: str) -> None:
+    import warp as wp
+
+    wp.config.quiet = True
+    wp.init()
+    scene = presets.sponza(WHITE)
+    scene.data(device)
+    before = path.peak_memory()
+    bake, (wall, cpu) = timed_bake(scene, gi.VisibilityField(), device, flight((int(width), int(height)), int(frames)))
+    row: Row = {"wall s": wall, "cpu s": cpu, "peak GB": path.peak_memory() / 1e9, "peak GB before": before / 1e9}
+    row |= {name: bake.counts[name] for name in ("cells", "samples", "rays", "rays_traced")}
+    with tempfile.TemporaryDirectory() as folder:
+        row["file MB"] = bake.save(Path(folder) / "bake.safetensors").stat().st_size / 1e6
+    print(json.dumps(row, default=float))
+
+
+# ---- relighting ----
+
+
+def relight_rows(quick: bool, device: str) -> list[Row]:
+    """Return seconds of the sky light's stage in Sponza while the sky turns."""
+    place = PLACES[0]
+    if place.missing:
+        return [{"table": "relight", "case": place.name, "skipped": place.missing}]
+    camera = place.camera().at_resolution(*((240, 135) if quick else (480, 270)))
+    return relight(place.name, place.scene(), camera, device, 4 if quick else 8)
+
+
+def relight(
+    name: str, scene: gi.Scene, camera: gi.Camera, device: str = "cpu", frames: int = 8, cell_size: float = 0.0
+) -> list[Row]:
+    """Return seconds of the first frame and of later ones, with transfers kept and without."""
+    rows = []
+    for kept in (True, False):
+        sky = smooth_sky()
+        scene.environment = sky
+        estimator = gi.VisibilityField(sky="harmonics", relight=kept, cell_size=cell_size)
+        settings = {"emitters": None, "indirect": None, "spp": SPP, "camera_samples": 1}
+        pipeline = gi.Pipeline(environment=estimator, **settings)
+        scheduler = gi.FrameScheduler(scene, gi.CameraPath.still(camera), pipeline, device)
+        seconds = []
+        for index in range(frames):
+            scene.environment = sky.rotated(15.0 * index)
+            seconds.append(scheduler.frame(index).timings["environment"])
+        row: Row = {"table": "relight", "case": name, "relight": kept, "first wall s": seconds[0]}
+        rows.append(row | {"later wall s": float(np.median(seconds[1:])), "frames": frames})
+    return rows
+
+
+def main() -> None:
+    """Bake the flight in this process and print a line of JSON; run the suite with ``warp-gi bench dvf``."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--child", nargs=4, required=True, help=argparse.SUPPRESS)
+    _child_main(*parser.parse_args().child)
+
+
+if __name__ == "__main__":
+    main()
