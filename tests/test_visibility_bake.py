@@ -179,7 +179,7 @@ def test_the_top_of_a_slab_sees_the_upper_half(resolution):
     for rows, sign in ((top, 1), (bottom, -1)):
         assert (states[rows][:, sign * up > margin] == VISIBLE).all()
         assert (states[rows][:, sign * up < -margin] == OCCLUDED).all()
-    assert ((up > margin).mean() > 0.2) and ((states[top] & VISIBLE) != 0)[:, up > 0].all()
+    assert (up > margin).mean() > 0.1 and ((states[top] & VISIBLE) != 0)[:, up > 0].all()
 
 
 def test_a_closed_box_shows_no_sky_inside():
