@@ -110,9 +110,9 @@ def glossy_rows(name: str, view: View, repetitions: int) -> list[Row]:
 def sweep_rows(view: View, repetitions: int, quick: bool, spp: int = SPP) -> list[Row]:
     """Return a row for each value of the settings that the paper varies, and of the resolution of the masks."""
     numbers = (80_000, 400_000, 2_000_000, 10_000_000, 0)
-    sizes, resolutions = (0.5, 1.0, 2.0, 4.0), (36, 48, 72, 96)
+    sizes, resolutions = (0.5, 1.0, 2.0, 4.0), (36, 48, 72, 84, 96)
     if quick:
-        numbers, sizes, resolutions = (80_000, 0), (1.0, 4.0), (72,)
+        numbers, sizes, resolutions = (80_000, 0), (1.0, 4.0), (84,)
     sweeps: list[tuple[str, str, dict[str, Any]]] = [
         ("samples", f"{number:,}" if number else "automatic", {"samples": number}) for number in numbers
     ]

@@ -124,7 +124,7 @@ def equal_error(
 
 
 def _ours(scene: gi.Scene, camera: gi.Camera, estimator: Any, device: str) -> Callable[[int], np.ndarray]:
-    settings = {"emitters": None, "indirect": None, "spp": SPP, "camera_samples": path.CAMERA_SAMPLES}
+    settings = {"emitters": None, "indirect": None, "spp": SPP}  # camera samples: the default
     pipeline = gi.Pipeline(environment=estimator, **settings)
     scheduler = gi.FrameScheduler(scene, gi.CameraPath.still(camera), pipeline, device)
     return lambda index: scheduler.frame(index).numpy("beauty").copy()

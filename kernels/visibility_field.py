@@ -12,14 +12,12 @@ one by one on CUDA, from the same text.
 
 import warp as wp
 
-from warp_gi.kernels.bvh import bvh_occluder
+from warp_gi.kernels.bvh import bvh_occluded, bvh_occluder
 from warp_gi.kernels.octahedral import octahedral_encode, octahedral_texel
 from warp_gi.kernels.sampling import (
     circle,
     cosine_direction,
     hash_uint,
-    morton_code,
-    pixel_sample_index,
     sample_1d,
     sample_2d,
 )
@@ -65,7 +63,7 @@ class FieldQuery:
     cosines: wp.array2d(dtype=wp.float32)  # [3, sets * set_size + 8] cosine-weighted directions about +z, set by set
     set_size: wp.int32
     set_count: wp.int32
-    hints: wp.array(dtype=wp.int32)  # [power of two] for hinted_occluded
+    hints: wp.array(dtype=wp.int32)  # [power of two] for hinted_occluded; empty to do without
     boxes: wp.array(dtype=wp.vec3)  # [2 * box] low and high corner of what moves
     moving: wp.array(dtype=wp.int32)  # [object] 1 if cells with SLOT_BOXED do not know its surfaces; empty if none
 
@@ -123,20 +121,13 @@ def meets_box(query: FieldQuery, origin: wp.vec3, direction: wp.vec3) -> wp.bool
     return False
 
 
-# Where the hint of a cell's rays through a texel is kept.
+# Whether the sky is occluded, tracing the ray, after what was in the way of the last ray with this key. Threads share
+# the hints and may overwrite each other's: that changes what an answer costs, never the answer.
 @wp.func
-def hint_index(query: FieldQuery, slot: wp.int32, texel: wp.int32) -> wp.int32:
-    key = wp.uint32((slot & SLOT_BITS) * 1337 + texel) * HASH_FACTOR
-    return wp.int32(key >> wp.uint32(8)) & (query.hints.shape[0] - 1)
-
-
-# Whether the sky is occluded, tracing the ray, after what was in the way of the last ray of this cell and texel.
-# Threads share the hints and may overwrite each other's: that changes what an answer costs, never the answer.
-@wp.func
-def hinted_occluded(
-    bvh: Bvh, query: FieldQuery, slot: wp.int32, texel: wp.int32, origin: wp.vec3, direction: wp.vec3
-) -> wp.bool:
-    index = hint_index(query, slot, texel)
+def hinted_occluded(bvh: Bvh, query: FieldQuery, key: wp.int32, origin: wp.vec3, direction: wp.vec3) -> wp.bool:
+    if query.hints.shape[0] == 0:
+        return bvh_occluded(bvh, origin, direction, float(wp.inf)) != 0
+    index = wp.int32((wp.uint32(key) * HASH_FACTOR) >> wp.uint32(8)) & (query.hints.shape[0] - 1)
     hint = query.hints[index]
     found = bvh_occluder(bvh, origin, direction, float(wp.inf), hint)
     if found != 0 and found != hint + 1:
@@ -344,8 +335,8 @@ def direction_texel(grid: VisibilityGrid, direction: wp.vec3) -> wp.int32:
 
 # The set that a pixel takes, and where a sample of a set (or, past its end, of the sets after it) lies.
 @wp.func
-def pixel_set(query: FieldQuery, x: wp.int32, y: wp.int32, seed: wp.uint32) -> wp.int32:
-    return wp.int32(hash_uint(seed ^ hash_uint(morton_code(x, y))) % wp.uint32(query.set_count))
+def pixel_set(query: FieldQuery, seed: wp.uint32) -> wp.int32:
+    return wp.int32(seed % wp.uint32(query.set_count))
 
 
 @wp.func
@@ -361,8 +352,14 @@ def turned_frame(frame: wp.mat33, turn: wp.float32) -> wp.mat33:
 
 
 @wp.func
-def pixel_turn(x: wp.int32, y: wp.int32, seed: wp.uint32) -> wp.float32:
-    return sample_1d(pixel_sample_index(x, y, 0, 0), seed, 0)
+def pixel_turn(morton: wp.uint32, seed: wp.uint32) -> wp.float32:
+    return sample_1d(morton, seed, 0)
+
+
+# The seed of a pixel's own random numbers.
+@wp.func
+def own_seed(morton: wp.uint32, seed: wp.uint32) -> wp.uint32:
+    return hash_uint(seed ^ hash_uint(morton))
 
 
 # Thread: a sample of a set. A pixel takes one set, so each set is well spread.

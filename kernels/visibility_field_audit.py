@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_gi.kernels.bvh import bvh_occluded
 from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, tiled_pixel
-from warp_gi.kernels.sampling import frame_of
+from warp_gi.kernels.sampling import frame_of, morton_code
 from warp_gi.kernels.surface import ray_origin, surface_shape
 from warp_gi.kernels.types import SceneData
 from warp_gi.kernels.visibility_field import (
@@ -14,6 +14,7 @@ from warp_gi.kernels.visibility_field import (
     lowest_bit,
     octet_bits,
     octet_direction,
+    own_seed,
     pixel_set,
     pixel_turn,
     set_sample,
@@ -59,8 +60,9 @@ def audit_field(
     s = surface_shape(scene, face, hits.u[pixel], hits.v[pixel], -hits.direction[pixel])
     origin = ray_origin(s)
     slot = slot_at(grid, origin)
-    frame = turned_frame(frame_of(s.normal), pixel_turn(p[0], p[1], settings.seed))
-    chosen = pixel_set(query, p[0], p[1], settings.seed)
+    morton = morton_code(p[0], p[1])
+    frame = turned_frame(frame_of(s.normal), pixel_turn(morton, settings.seed))
+    chosen = pixel_set(query, own_seed(morton, settings.seed))
     for start in range(0, settings.sample_count, 8):
         octet = cosine_octet(grid, query.cosines, slot, set_sample(query, chosen, start), frame, s.normal)
         bits = octet_bits(octet)

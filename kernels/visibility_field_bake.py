@@ -354,7 +354,7 @@ def bake_masks(
                 if ((known >> shift) & wp.uint32(3)) != wp.uint32(3):
                     traced += 1
                     state = wp.uint32(VISIBLE)
-                    if hinted_occluded(bvh, query, slot, texel, s.origin, octet_direction(octet, lane)):
+                    if hinted_occluded(bvh, query, slot * 1337 + texel, s.origin, octet_direction(octet, lane)):
                         state = wp.uint32(OCCLUDED)
                     chunks.partial[at] = known | (state << shift)
     chunks.traced[chunk] = traced

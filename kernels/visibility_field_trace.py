@@ -18,8 +18,8 @@ from warp_gi.kernels.bvh import bvh_occluded
 from warp_gi.kernels.environment import environment_lookup, environment_radiance, environment_sample
 from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, tiled_pixel
 from warp_gi.kernels.harmonics import Harmonics, cosine_harmonics, harmonics, vec9
-from warp_gi.kernels.sampling import hash_uint, morton_code, pixel_sample_index, pixel_seed, random_1d, sample_2d
-from warp_gi.kernels.surface import Surface, ray_origin, surface_at
+from warp_gi.kernels.sampling import morton_code, pixel_sample_index, pixel_seed, random_1d, sample_2d
+from warp_gi.kernels.surface import Surface, ray_origin, surface_shape, with_color
 from warp_gi.kernels.types import SceneData
 from warp_gi.kernels.visibility_field import (
     MODE_PAPER,
@@ -37,6 +37,7 @@ from warp_gi.kernels.visibility_field import (
     meets_box,
     octet_bits,
     octet_direction,
+    own_seed,
     pixel_set,
     pixel_turn,
     set_sample,
@@ -95,7 +96,7 @@ class FieldPixel:
     slot: wp.int32
     set: wp.int32  # of cosine directions, the first it takes
     turn: wp.float32  # of that set about the normal, in [0, 1)
-    index_base: wp.uint32  # of its samples in the sequence of the path tracer, and the seed that goes with it
+    index_base: wp.uint32  # of glossy samples in the path tracer's sequence, and the seed that goes with it
     index_seed: wp.uint32
     seed: wp.uint32
     first: wp.int32
@@ -316,10 +317,11 @@ def lambert_samples(
         else:
             sums.bsdf = sums.bsdf + sky.harmonics * whole
     if transfer.shape[0] > 0:
+        diffuse = with_color(scene, s).bsdf.diffuse
         for channel in range(3):
             for i in range(9):
                 at = p.index * 27 + channel * 9 + i
-                transfer[at] = transfer[at] + t[i] * s.bsdf.diffuse[channel]
+                transfer[at] = transfer[at] + t[i] * diffuse[channel]
     return sums
 
 
@@ -407,7 +409,7 @@ def trace_field(
     face = hits.face[pixel]
     if face < 0:
         return
-    s = surface_at(scene, face, hits.u[pixel], hits.v[pixel], -hits.direction[pixel])
+    s = surface_shape(scene, face, hits.u[pixel], hits.v[pixel], -hits.direction[pixel])
     p = FieldPixel()
     p.index = pixel
     p.origin = ray_origin(s)
@@ -415,20 +417,22 @@ def trace_field(
     if (p.slot & SLOT_BOXED) != 0 and query.moving.shape[0] > 0:
         if query.moving[scene.geometry.objects[face]] != 0:
             p.slot = NO_SLOT
-    p.set = pixel_set(query, at[0], at[1], settings.seed)
-    p.turn = pixel_turn(at[0], at[1], settings.seed)
-    p.index_base = pixel_sample_index(at[0], at[1], 0, settings.sample_bits)
-    p.index_seed = pixel_seed(at[0], at[1], settings.sample_bits, settings.seed)
-    p.seed = hash_uint(settings.seed ^ hash_uint(morton_code(at[0], at[1])))
+    morton = morton_code(at[0], at[1])
+    p.seed = own_seed(morton, settings.seed)
+    p.set = pixel_set(query, p.seed)
+    p.turn = pixel_turn(morton, settings.seed)
     p.first = settings.first_sample
     p.count = settings.sample_count
     wo = -(wp.transpose(s.shading) * hits.direction[pixel])
     sums = FieldSums()
     if s.bsdf.f90 <= 0.0:
         sums = lambert_samples(scene, grid, query, sky, p, s, buffers.transfer)
+        s = with_color(scene, s)  # now that its texels have had the time to arrive
         sums.bsdf = wp.cw_mul(sums.bsdf, s.bsdf.diffuse)
         sums.bsdf_square = wp.cw_mul(sums.bsdf_square, wp.cw_mul(s.bsdf.diffuse, s.bsdf.diffuse))
     else:
+        p.index_base = pixel_sample_index(at[0], at[1], 0, settings.sample_bits)
+        p.index_seed = pixel_seed(at[0], at[1], settings.sample_bits, settings.seed)
         sums = glossy_samples(scene, grid, query, sky, p, s, wo, buffers.transfer)
     if sky.kind == SKY_MAP:
         sums = light_samples(scene, grid, query, sky, p, s, wo, sums)

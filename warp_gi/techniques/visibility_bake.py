@@ -171,7 +171,7 @@ class FieldBaker:
         self.density = self._density()
         """Samples a square metre of one side."""
         self._seed = seed & 0xFFFFFFFF
-        self._query = field_query(device, self.rays, BAKE_SETS, seed, HINTS)
+        self._query = field_query(device, self.rays, BAKE_SETS, seed, 0 if device.is_cuda else HINTS)
         self._neighbors = neighbor_table(settings.resolution, settings.dilation)
         self._quiet = neighbor_table(settings.resolution, settings.dilation + 1)
         search = bake_kernels.PieceSearch()

@@ -28,6 +28,7 @@ _MODES = {
     "traced": field_kernels.MODE_THREE_STATE,
 }
 _SKIES = ("map", "harmonics")
+COSINE_SETS = 32  # turned about the normal at random, so few will do, and few stay in the first cache
 MOST_SET_SIZE = 4096
 MOST_SET_SAMPLES = 1 << 16
 MOST_RESOLUTION = 512
@@ -53,7 +54,7 @@ class VisibilityField(Estimator):
     coefficients a channel."""
     cell_size: float = 0.0
     """Metres; 0 is a 77th of the scene's longest axis, as in the paper's Sponza."""
-    resolution: int = 72
+    resolution: int = 84
     """Texels along a side of a cell's masks; the paper has 18."""
     samples: int = 0
     """Surface samples over the whole scene, by area; 0 is 256 for each side of as much surface as a face of a cell."""
@@ -158,7 +159,7 @@ class VisibilityField(Estimator):
 
     def _query(self, frame: Any) -> Any:
         size = min(-(-frame.pipeline.spp // 8) * 8, MOST_SET_SIZE)
-        query = field_query(frame.device, size, _set_count(size), frame.seed)
+        query = field_query(frame.device, size, COSINE_SETS, frame.seed)
         query.mode, query.verify = _MODES[self.mode], self.verify
         return query
 
