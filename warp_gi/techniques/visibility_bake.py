@@ -182,6 +182,11 @@ class FieldBaker:
         self._search = search
         self.rays_traced = self.rays_asked = self.samples = 0
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """Samples, their rays, and how many of those were traced, of all bakes so far."""
+        return {"samples": self.samples, "rays": self.rays_asked, "rays_traced": self.rays_traced}
+
     def _density(self) -> float:
         if not self.settings.samples:
             return SAMPLES_A_CELL / self.grid.cell_size**2

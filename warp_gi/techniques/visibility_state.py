@@ -119,22 +119,22 @@ class FieldState:
 
     def bake(self, cells: np.ndarray | None = None, progress: Any = None, most_rays: float = np.inf) -> None:
         """Add ``cells`` (all if None) to the lasting layer; of those, the first that ``most_rays`` pays for."""
-        started = time.perf_counter()
-        baker = self.baker("lasting")
+        started, baker = time.perf_counter(), self.baker("lasting")
         if cells is not None:
             cells = cells[(self.slots[cells] < 0) & ~self.empty[cells]]
             if len(cells) == 0:
                 return
             cells = self._affordable(baker, cells, most_rays)
         pieces = baker.find(cells)
+        before = baker.counts
         masks, flags = baker.bake(pieces, progress)
+        self.counts = {name: count + baker.counts[name] - before[name] for name, count in self.counts.items()}
         nothing = np.ones(self.grid.cell_count, bool) if cells is None else np.zeros(self.grid.cell_count, bool)
         if cells is not None:
             nothing[cells] = True
         nothing[pieces.cells] = False
         self.empty |= nothing
         self._add(pieces.cells, masks, flags)
-        self.counts = {"samples": baker.samples, "rays": baker.rays_asked, "rays_traced": baker.rays_traced}
         self.seconds += time.perf_counter() - started
 
     def _affordable(self, baker: FieldBaker, cells: np.ndarray, most_rays: float) -> np.ndarray:
