@@ -26,7 +26,7 @@ from warp_gi.scene import harmonics
 SPP = 64
 RMSE = 0.01
 TARGETS = "4 / 2.5 / 1.8"
-EQUAL_ERROR_PLACES = ("Sponza", "atrium", "street")
+EQUAL_ERROR_PLACES = ("Sponza", "atrium", "street", "Bistro")
 OURS: dict[str, Any] = {
     "field, map": gi.VisibilityField(),
     "field, harmonics": gi.VisibilityField(sky="harmonics"),
