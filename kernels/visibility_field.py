@@ -91,13 +91,18 @@ def slot_at(grid: VisibilityGrid, point: wp.vec3) -> wp.int32:
     return grid.slots[cell]
 
 
+# VISIBLE | OCCLUDED bits of a texel of the map that starts at word `start`.
+@wp.func
+def state_in(masks: wp.array(dtype=wp.uint32), start: wp.int32, texel: wp.int32) -> wp.uint32:
+    return (masks[start + texel / TEXELS_A_WORD] >> wp.uint32(2 * (texel % TEXELS_A_WORD))) & wp.uint32(3)
+
+
 # VISIBLE | OCCLUDED bits of a texel; 0 in a cell without a slot.
 @wp.func
 def texel_state(grid: VisibilityGrid, slot: wp.int32, texel: wp.int32) -> wp.int32:
     if slot < 0:
         return 0
-    word = grid.masks[(slot & SLOT_BITS) * grid.words + texel / TEXELS_A_WORD]
-    return wp.int32((word >> wp.uint32(2 * (texel % TEXELS_A_WORD))) & wp.uint32(3))
+    return wp.int32(state_in(grid.masks, (slot & SLOT_BITS) * grid.words, texel))
 
 
 # Whether the ray meets the box of something that moves.

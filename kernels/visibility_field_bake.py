@@ -28,6 +28,7 @@ from warp_gi.kernels.visibility_field import (
     octet_bits,
     octet_direction,
     octet_texel,
+    state_in,
     turned_frame,
 )
 
@@ -358,12 +359,6 @@ def bake_masks(
                         state = wp.uint32(OCCLUDED)
                     chunks.partial[at] = known | (state << shift)
     chunks.traced[chunk] = traced
-
-
-@wp.func
-def state_in(masks: wp.array(dtype=wp.uint32), start: wp.int32, texel: wp.int32) -> wp.uint32:
-    shift = wp.uint32(2 * (texel % TEXELS_A_WORD))
-    return (masks[start + texel / TEXELS_A_WORD] >> shift) & wp.uint32(3)
 
 
 # Cells being baked, slots counted from 0.

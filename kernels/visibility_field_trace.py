@@ -312,10 +312,7 @@ def lambert_samples(
     if subtracts:
         whole = cosine_harmonics(normal) * wp.float32(p.count)
         t = t + whole
-        if sky.kind == SKY_CONSTANT:
-            sums.bsdf = sums.bsdf + sky.radiance * wp.float32(p.count)
-        else:
-            sums.bsdf = sums.bsdf + sky.harmonics * whole
+        sums.bsdf = sums.bsdf + sky.harmonics * whole  # the paper's mode has no other sky
     if transfer.shape[0] > 0:
         diffuse = with_color(scene, s).bsdf.diffuse
         for channel in range(3):

@@ -224,9 +224,8 @@ class Scene:
         """Return a box around the meshes of node ``index`` at ``time`` [s]: low and high corner, float64 [2, 3]."""
         matrix, corners = self.world_from_node(index, time), []
         for mesh in self.nodes[index].meshes:
-            box = np.stack([mesh.points.min(axis=0), mesh.points.max(axis=0)]).astype(np.float64)
-            corners.append(np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(8, 3))
-        points = np.concatenate(corners) @ matrix[:3, :3].T + matrix[:3, 3]
+            corners.append(_box_corners(mesh))
+        points = np.concatenate(corners).astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
         return np.stack([points.min(axis=0), points.max(axis=0)])
 
     def world_from_node(self, index: int, time: float) -> np.ndarray:
@@ -276,9 +275,7 @@ class Scene:
             for world in (animation.world_matrices(self.nodes, time) for time in sorted(times)):
                 for node, matrix, moving in zip(self.nodes, world, self._moving, strict=True):
                     for mesh in node.meshes if moving else ():
-                        corners = np.stack([mesh.points.min(axis=0), mesh.points.max(axis=0)])
-                        corners = np.stack(np.meshgrid(*corners.T, indexing="ij"), axis=-1).reshape(8, 3)
-                        boxes.extend(geometry.transform_points(matrix, corners))
+                        boxes.extend(geometry.transform_points(matrix, _box_corners(mesh)))
         return np.stack([np.min(boxes, axis=0), np.max(boxes, axis=0)]).astype(np.float32)
 
 
@@ -398,6 +395,12 @@ class _DeviceScene:
         """Copy items from ``start`` to ``stop``; on the CPU target and source are the same memory."""
         if not self.device.is_cpu:
             target[start:stop].assign(source[start:stop])
+
+
+def _box_corners(mesh: Any) -> np.ndarray:
+    """Return the corners [8, 3] of the box around a mesh's points, in the space of its node."""
+    box = np.stack([mesh.points.min(axis=0), mesh.points.max(axis=0)])
+    return np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(8, 3)
 
 
 def _device(device: str | wp.Device | None) -> wp.Device:

@@ -45,13 +45,14 @@ class FieldState:
         self.words = words_of(settings.resolution)
         self.slots = np.full(self.grid.cell_count, field_kernels.NO_SLOT, np.int32)
         self.masks = np.empty((0, self.words), np.uint32)
-        self.flags = np.empty(0, np.int32)
         self.cells = np.empty(0, np.int32)
         """int32 [slot]: the cell of each slot of the lasting layer, in the order they were baked."""
         self.seconds = 0.0
         self.counts: dict[str, int] = {"samples": 0, "rays": 0, "rays_traced": 0}
         self.movers = scene.moving_objects
         self.poses: list[np.ndarray] | None = None
+        self.rests = False
+        """Whether nothing moved between the last two frames."""
         self.rest: dict[int, tuple[np.ndarray, int]] = {}
         """Cells of the layer that is baked with everything at rest: masks and flags."""
         self.empty = np.zeros(self.grid.cell_count, bool)
@@ -64,6 +65,11 @@ class FieldState:
         self.transfer_views = 0
         self._bakers: dict[str, FieldBaker] = {}
         self._dirty = True
+
+    @property
+    def flags(self) -> np.ndarray:
+        """int32 [slot]: the occlusion label of each slot of the lasting layer, as SLOT_LABEL or 0."""
+        return self.slots[self.cells] & field_kernels.SLOT_LABEL
 
     # ---- to and from a bake ----
 
@@ -148,7 +154,6 @@ class FieldState:
         self.slots[cells] = np.arange(len(self.cells), len(self.cells) + len(cells), dtype=np.int32) | flags | boxed
         self.cells = np.concatenate([self.cells, cells.astype(np.int32)])
         self.masks = np.concatenate([self.masks, masks])
-        self.flags = np.concatenate([self.flags, flags])
         self._dirty = True
 
     def bake_rest(self, cells: np.ndarray, most_rays: float) -> None:
