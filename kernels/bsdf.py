@@ -67,6 +67,28 @@ def fresnel(b: Bsdf, cos_h: wp.float32) -> wp.vec3:
     return b.f0 * (1.0 - s) + wp.vec3(b.f90 * s, b.f90 * s, b.f90 * s)
 
 
+# Pure Lambert of a colour.
+@wp.func
+def lambert(color: wp.vec3) -> Bsdf:
+    b = Bsdf()
+    b.diffuse = color
+    b.alpha = 1.0
+    return b
+
+
+# Schlick's Fresnel averaged over the hemisphere by cosine: of (1 - cos)^5 that is 1/21.
+@wp.func
+def average_fresnel(b: Bsdf) -> wp.vec3:
+    return b.f0 * (20.0 / 21.0) + wp.vec3(b.f90, b.f90, b.f90) / 21.0
+
+
+# What a surface reflects of light from everywhere, about.
+@wp.func
+def average_reflectance(b: Bsdf) -> wp.vec3:
+    f = average_fresnel(b)
+    return f + wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - f, b.diffuse)
+
+
 # Probability of sampling the GGX lobe: its share of the reflectance, looking from wo.
 @wp.func
 def specular_probability(b: Bsdf, cos_o: wp.float32) -> wp.float32:
@@ -146,6 +168,26 @@ def bsdf_sample(b: Bsdf, wo: wp.vec3, u_lobe: wp.float32, u: wp.vec2) -> BsdfSam
     if value.pdf > 0.0:
         r.pdf = value.pdf
         r.weight = value.value / value.pdf
+    return r
+
+
+# Direction of the GGX lobe alone, and F D V cos(wi) / pdf.
+@wp.func
+def specular_sample(b: Bsdf, wo: wp.vec3, u: wp.vec2) -> BsdfSample:
+    r = BsdfSample()
+    if wo[2] <= 0.0 or b.f90 <= 0.0:
+        return r
+    h = ggx_visible_normal(b.alpha, wo, u)
+    cos_h = wp.dot(wo, h)
+    r.wi = h * (2.0 * cos_h) - wo
+    cos_i = r.wi[2]
+    if cos_i <= 0.0:
+        return r
+    root_o = smith_root(b.alpha, wo[2])
+    # D cancels: pdf = D / (2 (cos_o + root_o)), f cos = F D cos_i / (2 (cos_o root_i + cos_i root_o))
+    share = cos_i * (wo[2] + root_o) / (wo[2] * smith_root(b.alpha, cos_i) + cos_i * root_o)
+    r.weight = fresnel(b, cos_h) * share
+    r.pdf = ggx_distribution(b.alpha, h[2], h[0] * h[0] + h[1] * h[1]) / (2.0 * (wo[2] + root_o))
     return r
 
 

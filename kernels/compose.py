@@ -16,8 +16,14 @@ class FrameSums:
     normal: wp.array(dtype=wp.vec3)
     moment1: wp.array(dtype=wp.vec3)
     moment2: wp.array(dtype=wp.vec3)
-    field_moment1: wp.array(dtype=wp.vec3)  # of an environment term that was not path traced with the rest, or empty
-    field_moment2: wp.array(dtype=wp.vec3)
+    environment_moment1: wp.array(dtype=wp.vec3)  # of a term that was not path traced with the rest, or empty
+    environment_moment2: wp.array(dtype=wp.vec3)
+    indirect_moment1: wp.array(dtype=wp.vec3)
+    indirect_moment2: wp.array(dtype=wp.vec3)
+    guide_diffuse: wp.array(dtype=wp.vec3)  # over camera samples, as albedo; empty without a denoiser
+    guide_specular: wp.array(dtype=wp.vec3)
+    lobe_diffuse: wp.array(dtype=wp.vec3)  # what estimators handed over apart, or empty
+    lobe_glossy: wp.array(dtype=wp.vec3)
     beauty: wp.array(dtype=wp.vec3)
     variance: wp.array(dtype=wp.vec3)  # of the mean
 
@@ -48,8 +54,16 @@ def compose_frame(first: wp.int32, camera_samples: wp.int32, samples: wp.int32, 
     b.indirect[i] = indirect
     b.albedo[i] = b.albedo[i] / views
     b.normal[i] = b.normal[i] / views
+    if b.guide_diffuse.shape[0] > 0:
+        b.guide_diffuse[i] = b.guide_diffuse[i] / views
+        b.guide_specular[i] = b.guide_specular[i] / views
+    if b.lobe_diffuse.shape[0] > 0:
+        b.lobe_diffuse[i] = b.lobe_diffuse[i] / n
+        b.lobe_glossy[i] = b.lobe_glossy[i] / n
     b.beauty[i] = emission + environment + emitters + indirect
     if samples > 1:
         b.variance[i] = variance_of_mean(b.moment1[i], b.moment2[i], n)
-        if b.field_moment1.shape[0] > 0:
-            b.variance[i] = b.variance[i] + variance_of_mean(b.field_moment1[i], b.field_moment2[i], n)
+        if b.environment_moment1.shape[0] > 0:
+            b.variance[i] = b.variance[i] + variance_of_mean(b.environment_moment1[i], b.environment_moment2[i], n)
+        if b.indirect_moment1.shape[0] > 0:
+            b.variance[i] = b.variance[i] + variance_of_mean(b.indirect_moment1[i], b.indirect_moment2[i], n)

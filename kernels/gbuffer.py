@@ -2,11 +2,12 @@
 
 import warp as wp
 
+from warp_gi.kernels.bsdf import average_fresnel
 from warp_gi.kernels.bvh import bvh_intersect
 from warp_gi.kernels.environment import environment_radiance
 from warp_gi.kernels.sampling import filter_offset, pixel_sample_index, pixel_seed, sample_2d
-from warp_gi.kernels.surface import surface_at, surface_emission
-from warp_gi.kernels.types import SceneData
+from warp_gi.kernels.surface import Surface, surface_at, surface_emission
+from warp_gi.kernels.types import Geometry, SceneData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -58,6 +59,15 @@ class SurfaceBuffers:
     motion: wp.array(dtype=wp.vec2)
     object_id: wp.array(dtype=wp.int32)
     material_id: wp.array(dtype=wp.int32)
+    guide_diffuse: wp.array(dtype=wp.vec3)  # this and the following: kernels.denoise.Guides, empty without a denoiser
+    guide_specular: wp.array(dtype=wp.vec3)
+    guide_distance: wp.array(dtype=wp.float32)
+    guide_position: wp.array(dtype=wp.vec3)
+    guide_previous: wp.array(dtype=wp.vec3)
+    guide_motion: wp.array(dtype=wp.vec2)
+    guide_normal: wp.array(dtype=wp.vec3)
+    guide_plane: wp.array(dtype=wp.vec3)
+    guide_object: wp.array(dtype=wp.int32)
 
 
 # Pixel of an item, in tiles; y may lie outside the picture.
@@ -109,6 +119,39 @@ def trace_primary(first: wp.int32, scene: SceneData, camera: CameraData, setting
     hits.face[pixel] = hit.face
 
 
+# Where the point (u, v) of a triangle was in the previous frame.
+@wp.func
+def previous_position(geometry: Geometry, face: wp.int32, u: wp.float32, v: wp.float32) -> wp.vec3:
+    ids = geometry.indices[face]
+    old = geometry.previous_points
+    return old[ids[0]] * (1.0 - u - v) + old[ids[1]] * u + old[ids[2]] * v
+
+
+# Adds what a denoiser goes by to the means, and keeps the rest of the first camera sample that hits. (The
+# nearest sample instead would be the same surface in more frames, but too much of it at outlines: more error.)
+@wp.func
+def add_guides(
+    buffers: SurfaceBuffers,
+    pixel: wp.int32,
+    s: Surface,
+    t: wp.float32,
+    was: wp.vec3,
+    motion: wp.vec2,
+    object_id: wp.int32,
+):
+    normal = wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
+    buffers.guide_diffuse[pixel] = buffers.guide_diffuse[pixel] + s.bsdf.diffuse
+    buffers.guide_specular[pixel] = buffers.guide_specular[pixel] + average_fresnel(s.bsdf)
+    if buffers.guide_object[pixel] == 0:
+        buffers.guide_distance[pixel] = t
+        buffers.guide_position[pixel] = s.position
+        buffers.guide_previous[pixel] = was
+        buffers.guide_motion[pixel] = motion
+        buffers.guide_normal[pixel] = normal
+        buffers.guide_plane[pixel] = s.normal
+        buffers.guide_object[pixel] = object_id + 1
+
+
 # Thread: a pixel. Adds what the first hit shows: emission, albedo, normal; the first camera
 # sample sets position, depth (along the view axis, inf on a miss), ids, and motion: where the
 # point was in the previous frame, minus where it is now, in pixels, x right and y down.
@@ -127,7 +170,7 @@ def shade_primary(
     face = hits.face[pixel]
     u = hits.u[pixel]
     v = hits.v[pixel]
-    was = direction
+    motion = project(previous_camera, direction) - project(camera, direction)
     position = wp.vec3(0.0, 0.0, 0.0)
     depth = float(wp.inf)
     object_id = int(-1)
@@ -139,17 +182,17 @@ def shade_primary(
         buffers.emission[pixel] = buffers.emission[pixel] + surface_emission(scene, face, u, v, -direction)
         buffers.albedo[pixel] = buffers.albedo[pixel] + s.base_color
         buffers.normal[pixel] = buffers.normal[pixel] + wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
-        if settings.camera_sample == 0:
-            ids = scene.geometry.indices[face]
-            old = scene.geometry.previous_points
-            was = old[ids[0]] * (1.0 - u - v) + old[ids[1]] * u + old[ids[2]] * v - previous_camera.position
-            position = s.position
-            depth = wp.dot(position - camera.position, camera.forward)
-            object_id = scene.geometry.objects[face]
-            material_id = scene.geometry.materials[face]
+        was = previous_position(scene.geometry, face, u, v)
+        motion = project(previous_camera, was - previous_camera.position) - project(camera, direction)
+        position = s.position
+        depth = wp.dot(position - camera.position, camera.forward)
+        object_id = scene.geometry.objects[face]
+        material_id = scene.geometry.materials[face]
+        if buffers.guide_object.shape[0] > 0:
+            add_guides(buffers, pixel, s, hits.t[pixel], was, motion, object_id)
     if settings.camera_sample == 0:
         buffers.position[pixel] = position
         buffers.depth[pixel] = depth
         buffers.object_id[pixel] = object_id
         buffers.material_id[pixel] = material_id
-        buffers.motion[pixel] = project(previous_camera, was) - project(camera, direction)
+        buffers.motion[pixel] = motion

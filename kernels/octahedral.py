@@ -61,3 +61,33 @@ def octahedral_wrap(column: wp.int32, row: wp.int32, resolution: wp.int32) -> wp
         j = wp.where(j < 0, -1 - j, 2 * resolution - 1 - j)
         i = resolution - 1 - i
     return j * resolution + i
+
+
+# The four texels around a point of a map and how far it is past the first, for bilinear reading across the edges.
+@wp.struct
+class OctahedralTaps:
+    texels: wp.vec4i  # at (column, row), (column + 1, row), (column, row + 1), (column + 1, row + 1)
+    x: wp.float32
+    y: wp.float32
+
+
+@wp.func
+def octahedral_taps(uv: wp.vec2, resolution: wp.int32) -> OctahedralTaps:
+    taps = OctahedralTaps()
+    x = uv[0] * wp.float32(resolution) - 0.5
+    y = uv[1] * wp.float32(resolution) - 0.5
+    column = wp.int32(wp.floor(x))
+    row = wp.int32(wp.floor(y))
+    taps.x = x - wp.float32(column)
+    taps.y = y - wp.float32(row)
+    if column >= 0 and row >= 0 and column + 1 < resolution and row + 1 < resolution:
+        texel = row * resolution + column
+        taps.texels = wp.vec4i(texel, texel + 1, texel + resolution, texel + resolution + 1)
+    else:
+        taps.texels = wp.vec4i(
+            octahedral_wrap(column, row, resolution),
+            octahedral_wrap(column + 1, row, resolution),
+            octahedral_wrap(column, row + 1, resolution),
+            octahedral_wrap(column + 1, row + 1, resolution),
+        )
+    return taps

@@ -57,6 +57,8 @@ class Render(SceneOptions):
     """A GLB, glTF, OBJ or PLY file, or the name of a built-in scene."""
     pipeline: Annotated[str, flag("NAME", "path")] = "path"
     """Preset, with estimators exchanged after commas: path,indirect=none. Its settings are the flags below."""
+    denoise: Annotated[str, flag("NAME", "as the pipeline says: none")] = ""
+    """none, oidn or spatiotemporal, whose settings are then flags below."""
     bake: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction, flag("FILE", "none; may be given more than once")] = ()
     """What warp-gi bake saved, for an estimator of the pipeline with the same settings."""
     environment_turn: float = 0.0
@@ -114,13 +116,15 @@ def main(arguments: Sequence[str]) -> int:
 
 def parse(arguments: Sequence[str]) -> Render:
     """Return the options; the pipeline named among them decides which settings there are."""
-    chosen = "path"
+    chosen = {"--pipeline": "path", "--denoise": ""}
     for index, argument in enumerate(arguments):
-        if argument == "--pipeline" and index + 1 < len(arguments):
-            chosen = arguments[index + 1]
-        elif argument.startswith("--pipeline="):
-            chosen = argument.partition("=")[2]
-    default = Render(settings=pipeline_named(chosen))
+        name, equals, value = argument.partition("=")
+        if name in chosen and (equals or index + 1 < len(arguments)):
+            chosen[name] = value if equals else arguments[index + 1]
+    settings = pipeline_named(chosen["--pipeline"])
+    if chosen["--denoise"]:
+        settings = replace(settings, denoise=_denoiser(chosen["--denoise"]))
+    default = Render(settings=settings)
     options = parse_options(
         Render,
         "render",
@@ -135,17 +139,20 @@ def parse(arguments: Sequence[str]) -> Render:
 
 
 def pipeline_named(text: str) -> Pipeline:
-    """Return the pipeline of "path" or "path,indirect=none,emitters=UniformLights".
+    """Return the pipeline of "path" or "path,indirect=none,emitters=UniformLights,denoise=SpatioTemporal".
 
-    Raises OptionError for unknown presets, terms and estimators.
+    Raises OptionError for unknown presets, terms, estimators and denoisers.
     """
     name, *changes = text.split(",")
     pipeline = Pipeline.preset(name.strip())
     known = {estimator.__name__: estimator for estimator in _subclasses(Estimator)}
     for change in changes:
         term, _, estimator = (part.strip() for part in change.partition("="))
+        if term == "denoise":
+            pipeline = replace(pipeline, denoise=_denoiser(estimator))
+            continue
         if term not in TERMS:
-            raise unknown_name("term of a pipeline", term, TERMS)
+            raise unknown_name("term of a pipeline", term, (*TERMS, "denoise"))
         if estimator.lower() == "none":
             pipeline = replace(pipeline, **{term: None})
         elif estimator in known:
@@ -153,6 +160,11 @@ def pipeline_named(text: str) -> Pipeline:
         else:
             raise unknown_name(f"{term} estimator", estimator, [k for k, v in known.items() if v.term == term])
     return pipeline
+
+
+def _denoiser(name: str) -> str | None:
+    """Return what a pipeline takes for "none", "oidn", "SpatioTemporal"."""
+    return None if name.lower() == "none" else name.lower()
 
 
 def _subclasses(base: type) -> list[type]:
@@ -186,6 +198,9 @@ def run(options: Render, report: Reporter) -> None:
             turn_sky(options, scene, sky, shot.index)  # what the frame's file has to say
         if not options.resume or not is_done(options, shot, scheduler, report):
             todo.append(shot)
+    if todo and len(todo) < len(shots) and options.settings.denoise is not None and options.settings.denoise.remembers:
+        report.line("every frame is rendered again: the denoiser goes by the frames before")
+        todo = shots
     if todo:
         check_writable(options.output.parent)
     if len(todo) < len(shots):

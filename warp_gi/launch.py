@@ -87,6 +87,14 @@ def on_device(values: np.ndarray, dtype: Any, device: wp.Device) -> wp.array:
     return wp.array(values, dtype=dtype, device=device, copy=not device.is_cpu)
 
 
+def copied(source: Any, struct: Any) -> Any:
+    """Return a copy of a kernel struct that shares its arrays."""
+    copy = struct()
+    for name in struct.vars:
+        setattr(copy, name, getattr(source, name))
+    return copy
+
+
 def load(kernel: wp.Kernel, device: wp.Device) -> None:
     """Compile or load the kernel's module now, and add the time to ``compile_seconds``."""
     global compile_seconds

@@ -7,9 +7,11 @@ from dataclasses import asdict, dataclass, fields
 from numbers import Integral
 from typing import Any
 
+from warp_gi.denoise import Denoiser, Oidn, SpatioTemporal, denoiser_named
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.techniques.baselines import BsdfPaths, PowerLights, TracedEnvironment, UniformLights
+from warp_gi.techniques.light_field_probes import LightFieldProbes
 from warp_gi.techniques.visibility_field import VisibilityField
 
 __all__ = ["PRESETS", "TERMS", "Estimator", "Pipeline"]
@@ -30,7 +32,7 @@ class Pipeline:
     """Direct light from the sky."""
     emitters: PowerLights | UniformLights | None = PowerLights()
     """Direct light from emissive triangles and punctual lights."""
-    indirect: BsdfPaths | None = BsdfPaths()
+    indirect: BsdfPaths | LightFieldProbes | None = BsdfPaths()
     """Light that arrives over other surfaces."""
     spp: int = 16
     """Samples a pixel."""
@@ -39,6 +41,8 @@ class Pipeline:
     less. 1 gives pixel centres, spp one a sample as a reference wants."""
     filter: str = "box"
     """Pixel filter: "box" or "tent" (two pixels wide)."""
+    denoise: SpatioTemporal | Oidn | None = None
+    """What makes the beauty of the noisy terms, or its name: "spatiotemporal", "oidn". The terms stay noisy."""
 
     def __post_init__(self) -> None:
         for name in ("spp", "camera_samples"):
@@ -53,6 +57,10 @@ class Pipeline:
             raise OptionError(f"camera_samples must be between 1 and spp ({self.spp}), got {self.camera_samples}")
         if self.filter not in FILTERS:
             raise unknown_name("pixel filter", self.filter, FILTERS)
+        if isinstance(self.denoise, str):
+            object.__setattr__(self, "denoise", denoiser_named(self.denoise))
+        if not isinstance(self.denoise, Denoiser | None):
+            raise OptionError(f"denoise must be a Denoiser, the name of one, or None, got {self.denoise!r:.80}")
         for term, estimator in zip(TERMS, (self.environment, self.emitters, self.indirect), strict=True):
             if estimator is not None and getattr(estimator, "term", None) != term:
                 raise OptionError(f"{term} must be an estimator of that term or None, got {estimator!r}")
@@ -74,7 +82,7 @@ class Pipeline:
         settings: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, Estimator):
+            if isinstance(value, Estimator | Denoiser):
                 settings[field.name] = type(value).__name__
                 settings.update({f"{field.name}.{name}": setting for name, setting in asdict(value).items()})
             else:
@@ -101,5 +109,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     "path": {},
     "direct": {"indirect": None},
     "dvf": {"environment": VisibilityField()},
+    "probes": {"indirect": LightFieldProbes()},
 }
 """Fields of each named pipeline, where they differ from the defaults."""

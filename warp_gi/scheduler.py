@@ -18,10 +18,10 @@ from warp_gi.baking import Bake
 from warp_gi.camera import Camera, CameraPath
 from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.estimator import Estimator
-from warp_gi.kernels import compose, gbuffer, path_trace, types
+from warp_gi.kernels import compose, denoise, gbuffer, path_trace, types
 from warp_gi.pipeline import TERMS, Pipeline
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.baselines import BsdfPaths, PowerLights
+from warp_gi.techniques.baselines import BsdfPaths, PowerLights, sky_probability
 
 _VEC3_BUFFERS = ("beauty", "emission", *TERMS, "albedo", "normal", "position", "variance", "moment1", "moment2")
 BUFFERS = (
@@ -58,10 +58,11 @@ class Frame:
         index: int,
         frame_time: float,
         seed: int,
+        previous_index: int,
     ) -> None:
         self.scene, self.data, self.pipeline, self.device = scene, data, pipeline, device
         self.camera, self.previous_camera = camera, previous_camera
-        self.index = index
+        self.index, self.previous_index = index, previous_index
         self.time = frame_time
         """Seconds."""
         self.seed = seed
@@ -84,24 +85,26 @@ class Frame:
             "object_id": zeros(wp.int32),
             "material_id": zeros(wp.int32),
         }
+        if pipeline.denoise is not None and pipeline.denoise.wants_lobes:
+            self._arrays |= {name: zeros(guide.type.dtype) for name, guide in denoise.Guides.vars.items()}
         self.hits = gbuffer.PrimaryHits()
         self.hits.direction = zeros(wp.vec3)
         for name in ("t", "u", "v"):
             setattr(self.hits, name, zeros(wp.float32))
         self.hits.face = zeros(wp.int32)
         self.camera_data, self._previous_camera_data = camera_data(camera), camera_data(previous_camera)
-        self._sky_probability = _sky_probability(scene)
+        self._sky_probability = sky_probability(scene)
         self.pass_settings = gbuffer.PassSettings()
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the buffers."""
-        return BUFFERS
+        """Names of the buffers: ``BUFFERS``, and with a denoiser "noisy", the beauty before it."""
+        return (*BUFFERS, "noisy") if "noisy" in self._arrays else BUFFERS
 
     def __getitem__(self, name: str) -> wp.array:
         """Return a buffer on the device, [height * width]; raises OptionError if there is none of that name."""
-        if name not in BUFFERS:
-            raise unknown_name("frame buffer", name, BUFFERS)
+        if name not in self.names:
+            raise unknown_name("frame buffer", name, self.names)
         return self._arrays[name]
 
     def numpy(self, name: str) -> np.ndarray:
@@ -124,6 +127,25 @@ class Frame:
                 self._arrays[f"{name}_moment{order}"] = wp.zeros(width * height, dtype=wp.vec3, device=self.device)
         return self._arrays[f"{name}_moment1"], self._arrays[f"{name}_moment2"]
 
+    def lobes(self) -> tuple[wp.array, wp.array] | None:
+        """Return sums over samples that an estimator of indirect light may add to, or None: then nobody reads them.
+
+        Both are vec3 [height * width]. The first is diffuse light as it comes in: times the diffuse albedo it is
+        the radiance that the diffuse lobe reflects. The second is the radiance that the glossy lobe reflects. What
+        is added here is part of the term's own buffer too; the denoiser takes it out of there.
+        """
+        if "guide_object" not in self._arrays:
+            return None
+        for name in ("lobe_diffuse", "lobe_glossy"):
+            if name not in self._arrays:
+                self._arrays[name] = wp.zeros_like(self._arrays["indirect"])
+        return self._arrays["lobe_diffuse"], self._arrays["lobe_glossy"]
+
+    def keep_noisy(self) -> None:
+        """Make the composed beauty the buffer "noisy", and an empty beauty for a denoiser to fill."""
+        self._arrays["noisy"] = self._arrays["beauty"]
+        self._arrays["beauty"] = wp.empty_like(self._arrays["noisy"])
+
     def launch(self, kernel: wp.Kernel, inputs: list[Any], count: int | None = None) -> None:
         """Run a kernel over ``count`` items, or over every pixel."""
         width, height = self.camera.resolution
@@ -144,7 +166,7 @@ class Frame:
         self.timings["compile"] = self.timings.get("compile", 0.0) + compiled
         self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - started - compiled
 
-    def _struct(self, struct: Any) -> Any:
+    def struct(self, struct: Any) -> Any:
         """Return a kernel struct whose fields are the buffers of the same names."""
         filled = struct()
         for name in struct.vars:
@@ -200,6 +222,8 @@ class FrameScheduler:
         self._bakes = _bakes_by_term(bakes, self._estimators)
         self._bake_digests = {f"bake.{term}": bake.digest[:16] for term, bake in self._bakes.items()}
         self._states: dict[str, Any] = {}
+        if pipeline.denoise is not None:
+            self._states["denoise"] = pipeline.denoise.start(self.device)
         self._keys: dict[str, str] = {}
         self._bake_seconds = 0.0
         self._baked_version = -1
@@ -262,15 +286,19 @@ class FrameScheduler:
             self._trace_view(frame, view)
             self._progress("trace", (view + 1) / views)
         with frame.stage("compose"):
-            frame.launch(compose.compose_frame, [views, self.pipeline.spp, frame._struct(compose.FrameSums)])
+            frame.launch(compose.compose_frame, [views, self.pipeline.spp, frame.struct(compose.FrameSums)])
+        if self.pipeline.denoise is not None:
+            with frame.stage("denoise"):
+                frame.keep_noisy()
+                self._states["denoise"] = self.pipeline.denoise.apply(frame, self._states["denoise"])
         return frame
 
     def _new_frame(self, index: int, previous_index: int) -> Frame:
         fps = self.camera.fps if isinstance(self.camera, CameraPath) else 24.0
         started, compiled = time.perf_counter(), launch.compile_seconds
         self.scene.update(index / fps, previous_index / fps, self.device)
-        data = _copied(self.scene.data(self.device), types.SceneData)
-        data.emitters = _copied(data.emitters, types.Emitters)
+        data = launch.copied(self.scene.data(self.device), types.SceneData)
+        data.emitters = launch.copied(data.emitters, types.Emitters)
         frame = Frame(
             self.scene,
             data,
@@ -281,6 +309,7 @@ class FrameScheduler:
             index,
             index / fps,
             _mix(self.seed, index),
+            previous_index,
         )
         compiled = launch.compile_seconds - compiled
         frame.timings |= {"bake": self._bake_seconds, "compile": compiled}
@@ -318,7 +347,7 @@ class FrameScheduler:
         with frame.stage("primary"):
             frame.launch_tiled(gbuffer.trace_primary, [frame.data, frame.camera_data, settings, frame.hits])
             cameras = [frame.camera_data, frame._previous_camera_data]
-            buffers = frame._struct(gbuffer.SurfaceBuffers)
+            buffers = frame.struct(gbuffer.SurfaceBuffers)
             frame.launch(gbuffer.shade_primary, [frame.data, *cameras, settings, frame.hits, buffers])
         frame._path_terms = 0
         for term, estimator in self._estimators.items():
@@ -331,7 +360,7 @@ class FrameScheduler:
             paths.roulette_depth = frame._paths.roulette_depth
             paths.clamp = frame._paths.clamp
             paths.sky_probability = frame._sky_probability
-            buffers = frame._struct(path_trace.PathBuffers)
+            buffers = frame.struct(path_trace.PathBuffers)
             frame.launch_tiled(
                 path_trace.trace_paths, [frame.data, frame.camera_data, settings, paths, frame.hits, buffers]
             )
@@ -428,28 +457,6 @@ def camera_data(camera: Camera) -> gbuffer.CameraData:
     data.forward = wp.vec3(*-back)
     data.width, data.height = width, height
     return data
-
-
-def _sky_probability(scene: Scene) -> float:
-    """Return how often a path vertex samples the sky rather than an emitter: by power, but neither under a fifth.
-
-    A sky sends pi radius^2 times its integral over the sphere into the scene; walls keep most of that out of a room.
-    """
-    environment = scene.environment
-    if environment is None or environment.pixels is None:
-        return 0.0
-    if scene.emitter_count == 0:
-        return 1.0
-    sky = 4.0 * math.pi**2 * scene.radius**2 * float(environment.mean_radiance @ (0.2126, 0.7152, 0.0722))
-    emitters = float(scene.emitter_powers().sum())
-    return min(max(sky / max(sky + emitters, 1e-30), 0.2), 0.8)
-
-
-def _copied(source: Any, struct: Any) -> Any:
-    copy = struct()
-    for name in struct.vars:
-        setattr(copy, name, getattr(source, name))
-    return copy
 
 
 def _mix(seed: int, frame: int) -> int:

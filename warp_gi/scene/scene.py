@@ -174,12 +174,16 @@ class Scene:
     @property
     def hash(self) -> str:
         """sha256 of all that decides the pictures but the cameras; equal in every process."""
-        digest = hashlib.sha256(self._hash_without_sky().encode())
+        digest = hashlib.sha256(self.contents_hash.encode())
         _update(digest, "no sky" if self._environment is None else self._environment.content_hash)
         return digest.hexdigest()
 
-    def _hash_without_sky(self) -> str:
-        """Hash of the rest, kept: a sky that changes from frame to frame must not cost a pass over all textures."""
+    @property
+    def contents_hash(self) -> str:
+        """sha256 of all that decides the pictures but cameras and sky.
+
+        Kept: a sky that changes from frame to frame must not cost a pass over all textures.
+        """
         if self._contents_hash is None:
             digest = hashlib.sha256(b"warp_gi scene 1" + self.geometry_hash.encode())
             flat = self._flat

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -97,3 +98,18 @@ class BsdfPaths(Estimator):
     def trace(self, frame: Any, state: Any) -> None:
         """Ask the shared path launch for this term."""
         frame.request_paths(path_trace.TERM_INDIRECT, self)
+
+
+def sky_probability(scene: Any) -> float:
+    """Return how often a path vertex samples the sky rather than an emitter: by power, but neither under a fifth.
+
+    A sky sends pi radius^2 times its integral over the sphere into the scene; walls keep most of that out of a room.
+    """
+    environment = scene.environment
+    if environment is None or environment.pixels is None:
+        return 0.0
+    if scene.emitter_count == 0:
+        return 1.0
+    sky = 4.0 * math.pi**2 * scene.radius**2 * float(environment.mean_radiance @ (0.2126, 0.7152, 0.0722))
+    emitters = float(scene.emitter_powers().sum())
+    return min(max(sky / max(sky + emitters, 1e-30), 0.2), 0.8)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,16 +22,22 @@ from warp_gi.files import replacing
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_audit as audit_kernels
 from warp_gi.pipeline import Pipeline
-from warp_gi.preview import magma, tone_map, write_png
+from warp_gi.preview import tone_map, write_png
 from warp_gi.scene.scene import Scene
 from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence import frame_path
-from warp_gi.techniques.visibility_bake import neighbor_table
+from warp_gi.techniques.legends import exposure_of, round_above, with_keys, with_scale
+from warp_gi.techniques.octahedral_atlas import (
+    MAPPING,
+    PADDING,
+    PADDING_TEXT,
+    padded,
+    texels_of,
+    warn_if_too_large,
+    write_parts,
+)
 
 TEXTURE_VISIBLE, TEXTURE_OCCLUDED, TEXTURE_LABEL = 128, 64, 32
-PADDING = 1
-GPU_TEXELS = 16384
-"""Along a side of a texture; what graphics hardware takes."""
 SHOW_SAMPLES = 64
 MAPS_PIXELS = 1600
 """Along a side of the picture of maps, about."""
@@ -47,14 +52,10 @@ TEXT = {
     "needs tracing, it reaches the sky. Only occluded: no ray needs tracing, it is blocked. Both, or none: trace. "
     "label: more than half of the map is occluded; it is the same in all texels of a cell, padding included. Cells "
     "without surfaces, or that were not baked, are 0.",
-    "map": "Octahedral, seen from above: +y in the middle, -y in the corners, +x towards higher columns, +z towards "
-    "higher rows. Of a direction d: s = 0.5 / (|d.x| + |d.y| + |d.z|); a = d.x * s; b = d.z * s; if d.y < 0: (a, b) = "
-    "((0.5 - |b|) * sign(a), (0.5 - |a|) * sign(b)), where sign(0) is 1; column = min(floor((a + 0.5) * resolution), "
-    "resolution - 1), row the same of b.",
+    "map": MAPPING,
     "position": "Look up the position that rays start from: the surface point moved a little along its normal, to the "
     "side that is seen. A point on the border of two cells otherwise finds the wrong one.",
-    "padding": "One texel around each map repeats what lies across its edge on the sphere, so that a lookup that is "
-    "off by one texel stays in the cell.",
+    "padding": f"{PADDING_TEXT}, so that a lookup that is off by one texel stays in the cell.",
 }
 
 
@@ -81,20 +82,6 @@ def _resolution(bake: Bake) -> int:
     return int(bake.settings["resolution"])
 
 
-def padded(maps: np.ndarray) -> np.ndarray:
-    """Return maps [..., resolution, resolution] with a border of one texel that repeats what lies across the edge."""
-    size = maps.shape[-1]
-    near = neighbor_table(size, 1).reshape(size, size, 3, 3)
-    source = np.empty((size + 2, size + 2), np.int32)
-    source[1:-1, 1:-1] = near[:, :, 1, 1]
-    source[0, 1:-1], source[-1, 1:-1] = near[0, :, 0, 1], near[-1, :, 2, 1]
-    source[1:-1, 0], source[1:-1, -1] = near[:, 0, 1, 0], near[:, -1, 1, 2]
-    for corner in (0, -1):
-        for side in (0, -1):
-            source[corner, side] = near[corner, side, 2 * (corner != 0), 2 * (side != 0)]
-    return maps.reshape(*maps.shape[:-2], -1)[..., source]
-
-
 def _layer(bake: Bake, y: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return which entries of the bake have grid y, and their x and z."""
     nx, ny, _ = (int(n) for n in bake.arrays["grid_shape"])
@@ -114,12 +101,7 @@ def export_textures(bake: Bake, path: str | Path) -> list[Path]:
     nx, ny, nz = (int(n) for n in bake.arrays["grid_shape"])
     maps = padded(cell_maps(bake))
     size = maps.shape[-1]
-    if max(nx, nz) * size > GPU_TEXELS:
-        warnings.warn(
-            f"{path.name}: layers of {nx * size} x {nz * size} texels are more than the {GPU_TEXELS} a side that GPUs "
-            "take; use larger cells or a lower resolution",
-            stacklevel=2,
-        )
+    warn_if_too_large(path.name, nx * size, nz * size, "use larger cells or a lower resolution")
 
     def pixels(y: int) -> np.ndarray:
         chosen, x, z = _layer(bake, y)
@@ -138,7 +120,9 @@ def export_textures(bake: Bake, path: str | Path) -> list[Path]:
             _write_gray(file, pixels(y))
     else:
         files = [path]
-        _write_parts(path, pixels, ny)
+        with replacing(path) as part:  # half floats hold 0 to 255 exactly
+            planes = lambda y: pixels(y)[:, :, None].astype(np.float16)  # noqa: E731
+            write_parts(part, path, planes, ("Y",), [_part_name(y) for y in range(ny)])
     layers = {"files": [file.name for file in files]}
     if not is_png:
         layers = {"file": path.name, "parts": [_part_name(y) for y in range(ny)], "channel": "Y"}
@@ -171,32 +155,6 @@ def _part_name(y: int) -> str:
     return f"layer{y:04d}"
 
 
-def _write_parts(path: Path, pixels: Any, count: int) -> None:
-    """Write ``pixels(0)`` to ``pixels(count - 1)`` as parts of an EXR file; half floats hold 0 to 255 exactly."""
-    import OpenImageIO as oiio
-
-    first = pixels(0)
-    specs = []
-    for y in range(count):
-        spec = oiio.ImageSpec(first.shape[1], first.shape[0], 1, "half")
-        spec.channelnames = ("Y",)
-        spec.attribute("compression", "zip")
-        spec.attribute("DateTime", "")
-        spec.attribute("oiio:subimagename", _part_name(y))
-        specs.append(spec)
-    with replacing(path) as part:
-        output = oiio.ImageOutput.create("exr")
-        done = output.open(str(part), tuple(specs)) if count > 1 else output.open(str(part), specs[0])
-        for y in range(count):
-            if y:
-                done = done and output.open(str(part), specs[y], "AppendSubimage")
-            done = done and output.write_image(np.ascontiguousarray(pixels(y)[:, :, None], np.float32))
-        done = output.close() and done
-        if not done or output.has_error:
-            problem = " ".join(output.geterror().split()) or "unknown failure"
-            raise OSError(f"cannot write {path}: {problem.replace(str(part), str(path))}")
-
-
 # ---- an example of a reader ----
 
 
@@ -214,13 +172,8 @@ def look_up(layers: np.ndarray, info: dict[str, Any], positions: np.ndarray, dir
     shape = np.array([info["grid_shape"][axis] for axis in "xyz"])
     inside = ((cell >= 0) & (cell < shape)).all(1)
     x, y, z = np.clip(cell, 0, shape - 1).T
-    p = 0.5 * directions / np.abs(directions).sum(1, keepdims=True)
-    a, b = p[:, 0], p[:, 2]
-    folded_a = (0.5 - np.abs(b)) * np.where(a < 0, -1, 1)
-    folded_b = (0.5 - np.abs(a)) * np.where(b < 0, -1, 1)
-    a, b = np.where(p[:, 1] < 0, [folded_a, folded_b], [a, b])
     size, padding = info["resolution"], info["padding"]
-    column, row = (np.clip(((v + 0.5) * size).astype(int), 0, size - 1) + padding for v in (a, b))
+    column, row = (at + padding for at in texels_of(directions, size))
     tile = size + 2 * padding
     return np.where(inside, layers[y, z * tile + row, x * tile + column], 0)
 
@@ -268,19 +221,19 @@ def write_pictures(
     share, label, surface = _audit(scene, camera, bake, replace(settings, **fields), device, seed)
     error = np.abs(image.astype(np.float64) - reference).mean(-1)
     wrong = error[error > 1e-4 * reference.mean()]
-    top = _round_above(float(np.quantile(wrong, 0.9))) if wrong.size else 1.0
+    top = round_above(float(np.quantile(wrong, 0.9))) if wrong.size else 1.0
     rmse = math.sqrt(np.mean(np.square(image.astype(np.float64) - reference)))
     mean = float(share[surface].mean()) if surface.any() else 0.0
     labels = np.full((*label.shape, 3), NOTHING_COLOR, np.uint8)
     for value, color in ((0, VISIBLE_COLOR), (1, OCCLUDED_COLOR), (-1, UNKNOWN_COLOR)):
         labels[surface & (label == value)] = color
     told = f"RMSE {rmse:.2g} of mean {reference.mean():.2g}; {wrong.size / error.size:.2%} of the pixels are wrong"
-    exposure = _exposure(reference)
+    exposure = exposure_of(reference)
     pictures = {
         "maps": _maps_picture(bake),
         "render": tone_map(image, exposure),
-        "error": _with_scale(error, top, f"|error|, W/(m2 sr); {told}"),
-        "labels": _with_keys(
+        "error": with_scale(error, top, f"|error|, W/(m2 sr); {told}"),
+        "labels": with_keys(
             labels,
             (
                 (VISIBLE_COLOR, "label 0: up to half occluded"),
@@ -289,7 +242,7 @@ def write_pictures(
                 (NOTHING_COLOR, "no surface"),
             ),
         ),
-        "traced": _with_scale(share, 1.0, f"share of rays traced, mean {mean:.1%} ({settings.mode})"),
+        "traced": with_scale(share, 1.0, f"share of rays traced, mean {mean:.1%} ({settings.mode})"),
     }
     paths = []
     for name, pixels in pictures.items():
@@ -300,19 +253,6 @@ def write_pictures(
 
 def _sky_only(settings: Any, samples: int, **more: Any) -> Pipeline:
     return Pipeline(environment=settings, emitters=None, indirect=None, spp=samples, **more)
-
-
-def _round_above(value: float) -> float:
-    """Return 1, 2 or 5 times a power of ten, the next at or above ``value``."""
-    power = 10.0 ** math.floor(math.log10(value))
-    return next((step * power for step in (1, 2, 5) if step * power >= value), 10 * power)
-
-
-def _exposure(image: np.ndarray) -> float:
-    """Return stops that bring the mean of what is lit to about 0.3: sky light alone may be dim indoors."""
-    light = image.mean(-1)
-    lit = light[light > 0]
-    return 0.0 if not lit.size else float(np.clip(math.log2(0.3 / float(lit.mean())), -4, 8))
 
 
 def _audit(
@@ -367,7 +307,7 @@ def _maps_picture(bake: Bake) -> np.ndarray:
     note = f"height {low[1] + y * cell:.3g} to {low[1] + (y + 1) * cell:.3g} m, {len(chosen)} cells"
     if not shown.all():
         note += f", {int(shown.sum())} of them here"
-    return _with_keys(canvas, keys, f"{note}; from above: x right, z down")
+    return with_keys(canvas, keys, f"{note}; from above: x right, z down")
 
 
 def _part(bake: Bake, chosen: np.ndarray) -> Bake:
@@ -383,80 +323,3 @@ def _fullest(values: np.ndarray, most: int) -> tuple[int, int]:
     sums = np.cumsum(np.append(0, np.bincount(values - low, minlength=high - low)))
     first = low + int((sums[most:] - sums[:-most]).argmax())
     return first, first + most
-
-
-# ---- legends ----
-
-_LINE = 26  # pixels
-
-
-def _font(size: int = 16) -> Any:
-    from PIL import ImageFont
-
-    try:
-        return ImageFont.load_default(size)
-    except TypeError:  # Pillow before 10.1
-        return ImageFont.load_default()
-
-
-def _with_keys(image: np.ndarray, keys: tuple[tuple[tuple[int, int, int], str], ...], title: str = "") -> np.ndarray:
-    """Return the image with lines below it that name its colours."""
-    from PIL import Image, ImageDraw
-
-    font = _font()
-    rows: list[list[tuple[Any, str, int]]] = [[]]
-    width, at = max(image.shape[1], 360), 8
-    for color, text in keys:
-        needed = 22 + math.ceil(font.getlength(text)) + 18
-        if at + needed > width and rows[-1]:
-            rows.append([])
-            at = 8
-        rows[-1].append((color, text, at))
-        at += needed
-    titles = _wrapped(title, font, width - 16)
-    bar = Image.new("RGB", (width, _LINE * (len(rows) + len(titles)) + 6), (255, 255, 255))
-    draw = ImageDraw.Draw(bar)
-    for row, entries in enumerate(rows):
-        for color, text, x in entries:
-            y = 4 + _LINE * row
-            draw.rectangle((x, y + 2, x + 16, y + 18), fill=color, outline=(90, 90, 90))
-            draw.text((x + 22, y), text, fill=(0, 0, 0), font=font)
-    for row, text in enumerate(titles):
-        draw.text((8, 4 + _LINE * (len(rows) + row)), text, fill=(0, 0, 0), font=font)
-    return _stacked(image, np.asarray(bar))
-
-
-def _with_scale(values: np.ndarray, top: float, title: str) -> np.ndarray:
-    """Return ``values`` in the magma colours, with a scale from 0 to ``top`` below."""
-    from PIL import Image, ImageDraw
-
-    font, width = _font(), max(values.shape[1], 360)
-    titles = _wrapped(title, font, width - 16)
-    bar = Image.new("RGB", (width, _LINE * (1 + len(titles)) + 6), (255, 255, 255))
-    draw = ImageDraw.Draw(bar)
-    end = f"{top:g}"
-    right = width - 16 - math.ceil(font.getlength(end))
-    draw.text((8, 4), "0", fill=(0, 0, 0), font=font)
-    draw.text((right + 8, 4), end, fill=(0, 0, 0), font=font)
-    ramp = magma(np.broadcast_to(np.linspace(0, 1, right - 28, dtype=np.float32), (16, right - 28)))
-    bar.paste(Image.fromarray(ramp), (28, 6))
-    for row, text in enumerate(titles):
-        draw.text((8, 4 + _LINE * (1 + row)), text, fill=(0, 0, 0), font=font)
-    return _stacked(magma(values / top), np.asarray(bar))
-
-
-def _wrapped(text: str, font: Any, width: int) -> list[str]:
-    lines: list[str] = []
-    for word in text.split():
-        if lines and font.getlength(f"{lines[-1]} {word}") <= width:
-            lines[-1] += f" {word}"
-        else:
-            lines.append(word)
-    return lines
-
-
-def _stacked(image: np.ndarray, legend: np.ndarray) -> np.ndarray:
-    """Return the image above its legend, both on white, as wide as the wider."""
-    width = max(image.shape[1], legend.shape[1])
-    parts = [np.pad(p, ((0, 0), (0, width - p.shape[1]), (0, 0)), constant_values=255) for p in (image, legend)]
-    return np.concatenate(parts)

@@ -205,7 +205,7 @@ class VisibilityField(Estimator):
             transfer = state.transfer
         buffers = trace_kernels.FieldBuffers()
         buffers.environment, buffers.transfer = frame["environment"], transfer
-        buffers.moment1, buffers.moment2 = frame.moments("field")
+        buffers.moment1, buffers.moment2 = frame.moments("environment")
         field = trace_kernels.Field()
         field.grid, field.query, field.sky = state.data, state.query, state.sky
         inputs = [frame.data, frame.camera_data, frame.pass_settings, field, frame.hits, buffers]

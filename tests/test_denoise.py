@@ -1,0 +1,414 @@
+"""Denoisers: the filters against NumPy, what must not blur or leak, memory over frames, and less error."""
+
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_gi as gi
+from warp_gi import launch
+from warp_gi.denoise import Oidn, SpatioTemporal
+from warp_gi.errors import OptionError
+from warp_gi.kernels import denoise
+
+CPU = wp.get_device("cpu")
+W, H = 15, 11
+NO_BLUR = {"diffuse_radius": 0, "glossy_radius": 0}
+
+
+def filled(struct, **arrays):
+    """A kernel struct of arrays [height, width, ...]; those not given stay empty."""
+    result = struct()
+    for name, values in arrays.items():
+        dtype = struct.vars[name].type.dtype
+        values = np.ascontiguousarray(values.reshape(W * H, *values.shape[2:]))
+        setattr(result, name, wp.array(values, dtype=dtype, device=CPU))
+    return result
+
+
+def image(array, *shape):
+    return array.numpy().reshape(*shape, -1)
+
+
+def plane_guides(**changes):
+    """Guides of a plane at z = 0 seen from 1 m, a pixel 1 cm wide."""
+    y, x = np.mgrid[:H, :W].astype(np.float32)
+    up = np.zeros((H, W, 3), np.float32) + np.float32([0, 0, 1])
+    position = np.stack([0.01 * x, -0.01 * y, np.zeros_like(x)], -1)
+    guides = {
+        "guide_distance": np.ones((H, W), np.float32),
+        "guide_position": position,
+        "guide_previous": position,
+        "guide_motion": np.zeros((H, W, 2), np.float32),
+        "guide_normal": up,
+        "guide_plane": up,
+        "guide_object": np.ones((H, W), np.int32),
+    }
+    return guides | changes
+
+
+def blurred(guides, light, length=None, **changes):
+    """What the spatial kernel makes of ``light`` [height, width, 3]."""
+    settings = denoise.SpatialSettings()
+    values = {"radius": 6, "stride": 2, "deviation": 3.0, "plane_distance": 0.02, "normal_power": 8.0}
+    values |= {"samples": 1.0, "longest": 99.0, "shrink": 0.0, "width": W, "height": H}
+    for name, value in (values | changes).items():
+        setattr(settings, name, value)
+    length = np.ones((H, W), np.float32) if length is None else length
+    source = filled(denoise.Signals, diffuse=light, length=length)
+    out = wp.zeros_like(source.diffuse)
+    inputs = [settings, filled(denoise.Guides, **guides), source.diffuse, source.length, out]
+    launch.launch(denoise.filter_neighbourhood, W * H, inputs, CPU)
+    return image(out, H, W)
+
+
+def random_guides(rng):
+    normal = rng.normal((0, 0, 1), 0.3, (H, W, 3))
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    guides = plane_guides(guide_normal=normal.astype(np.float32))
+    guides["guide_position"] = guides["guide_position"] + rng.normal(0, 0.02, (H, W, 3)).astype(np.float32)
+    guides["guide_distance"] = rng.uniform(0.5, 2.0, (H, W)).astype(np.float32)
+    guides["guide_object"] = (rng.random((H, W)) < 0.9).astype(np.int32)
+    return guides
+
+
+def test_spatial_filter_is_the_formula():
+    rng = np.random.default_rng(1)
+    guides, light = random_guides(rng), rng.random((H, W, 3)).astype(np.float32)
+    length = rng.integers(1, 200, (H, W)).astype(np.float32)
+    result = blurred(guides, light, length, samples=2.0, shrink=1 / 4, longest=50.0)
+    position, normal, plane = (guides[f"guide_{name}"].astype(float) for name in ("position", "normal", "plane"))
+    expected = light.astype(float).copy()
+    for y, x in np.argwhere(guides["guide_object"] > 0):
+        deviation = 3.0 * (2.0 * min(length[y, x], 50.0)) ** -0.25
+        steps = min(6, int(3 * deviation)) // 2
+        total, mean = 0.0, np.zeros(3)
+        for ty in range(y - 2 * steps, y + 2 * steps + 1, 2):
+            for tx in range(x - 2 * steps, x + 2 * steps + 1, 2):
+                if not (0 <= ty < H and 0 <= tx < W and guides["guide_object"][ty, tx]):
+                    continue
+                away = plane[y, x] @ (position[ty, tx] - position[y, x]) / (0.02 * guides["guide_distance"][y, x])
+                near = ((ty - y) ** 2 + (tx - x) ** 2) / deviation**2
+                e = 0.5 * near + 0.5 * away**2 + 8.0 * (1 - normal[y, x] @ normal[ty, tx])
+                if e < 12:
+                    total, mean = total + np.exp(-e), mean + np.exp(-e) * light[ty, tx]
+        expected[y, x] = mean / total
+    assert np.abs(expected - light).max() > 0.3
+    assert np.abs(result - expected).max() < 2e-5
+
+
+@pytest.mark.parametrize("edge", ["normal", "depth"])
+def test_edges_do_not_leak(edge):
+    guides = plane_guides()
+    right = np.arange(W) > W // 2
+    if edge == "normal":  # a wall that rises from the plane
+        guides["guide_normal"] = np.where(right[None, :, None], np.float32([-1, 0, 0]), guides["guide_normal"])
+        guides["guide_plane"] = guides["guide_normal"]
+        x = guides["guide_position"][..., 0]
+        foot = 0.01 * (W // 2 + 0.5)
+        guides["guide_position"] = guides["guide_position"].copy()
+        guides["guide_position"][..., 2] = np.where(right, x - foot, 0)
+        guides["guide_position"][..., 0] = np.where(right, foot, x)
+    else:
+        guides["guide_position"] = guides["guide_position"] + np.float32([0, 0, -0.15]) * right[None, :, None]
+    light = np.where(right[None, :, None], np.float32([100, 0, 1]), np.float32([0, 1, 1])) + np.zeros((H, 1, 1), "f4")
+    result = blurred(guides, light)
+    assert np.abs(result - light).max() < (0.1 if edge == "normal" else 1e-4)
+    assert np.abs(blurred(plane_guides(), light) - light).max() > 30
+
+
+@pytest.mark.parametrize("lobes", [False, True])
+def test_separated_light_put_back_is_the_light(lobes):
+    """Whatever the albedo, and black and Lambert surfaces too; constant light is constant before it meets them."""
+    rng = np.random.default_rng(2)
+    color = lambda: rng.random((H, W, 3)).astype(np.float32)  # noqa: E731
+    diffuse, specular = color(), color() * (rng.random((H, W, 1)) < 0.5)
+    diffuse[:, :4], specular[:, :2] = 0, 0
+    guides = filled(
+        denoise.Guides, guide_diffuse=diffuse, guide_specular=specular, guide_object=np.ones((H, W), np.int32)
+    )
+    terms = {"emission": color()} | {name: color() for name in ("environment", "emitters", "indirect")}
+    reflected = diffuse + specular
+    if lobes:
+        terms |= {"lobe_diffuse": color(), "lobe_glossy": color() * (specular > 0)}
+        terms["indirect"] = terms["indirect"] * reflected + diffuse * terms["lobe_diffuse"] + terms["lobe_glossy"]
+    else:
+        terms["indirect"] = terms["indirect"] * reflected
+    terms["environment"], terms["emitters"] = 2 * reflected, terms["emitters"] * reflected
+    light = filled(denoise.NoisyLight, noisy=sum(terms[n] for n in list(terms)[:4]), **terms)
+    signals = filled(denoise.Signals, diffuse=color(), glossy=color(), length=np.ones((H, W), np.float32))
+    launch.launch(denoise.separate_light, W * H, [light, guides, signals], CPU)
+    beauty = wp.zeros(W * H, dtype=wp.vec3, device=CPU)
+    launch.launch(denoise.put_back, W * H, [light, guides, signals, beauty], CPU)
+    assert np.allclose(image(beauty, H, W), image(light.noisy, H, W), rtol=1e-5, atol=1e-5)
+    if not lobes:
+        flat = filled(
+            denoise.NoisyLight,
+            **{n: np.zeros((H, W, 3), np.float32) for n in ("emission", "emitters", "indirect", "noisy")},
+            environment=2 * reflected,
+        )
+        launch.launch(denoise.separate_light, W * H, [flat, guides, signals], CPU)
+        incident = image(signals.diffuse, H, W)[reflected > 1e-6]
+        assert np.allclose(incident, 2, rtol=1e-5)
+
+
+SIZE = (32, 24)
+
+
+def quad(z, half, material):
+    points = np.float32([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
+    uvs = np.float32([[0, 0], [1, 0], [1, 1], [0, 1]])
+    return gi.Mesh(points, np.array([[0, 1, 2], [0, 2, 3]], np.int32), material, uvs=uvs)
+
+
+def checkered(metallic=0.0):
+    rng = np.random.default_rng(3)
+    texture = gi.Texture("checks", rng.integers(0, 255, (8, 8, 4), dtype=np.uint8) | np.uint8([0, 0, 0, 255]))
+    return gi.Material(base_color_texture=texture, specular=metallic, metallic=metallic, roughness=1.0)
+
+
+def scene(environment=(0.3, 0.4, 0.5)):
+    """A textured card before a textured wall, and a lamp."""
+    lamp = gi.Material("lamp", emission=(9.0, 6.0, 3.0))
+    nodes = [
+        gi.Node("wall", [quad(-2.0, 5.0, checkered())]),
+        gi.Node("card", [quad(0.0, 0.7, checkered())]),
+        gi.Node("lamp", [quad(4.0, 0.5, lamp)]),
+    ]
+    return gi.Scene(nodes, environment=environment)
+
+
+def still():
+    return gi.CameraPath.still(gi.Camera.look_at((0, 0, 3.5), (0, 0, 0), hfov=60, resolution=SIZE))
+
+
+def sideways(step=0.3):
+    keys = (gi.CameraKey(0.0, (0, 0, 3.5), (0, 0, 0)), gi.CameraKey(1.0, (step, 0, 3.5), (step, 0, 0)))
+    return gi.CameraPath(keys, fps=1, resolution=SIZE)
+
+
+def lengths(scheduler):
+    return scheduler.state("denoise").average.length.numpy().reshape(SIZE[::-1])
+
+
+def test_textures_under_even_light_are_not_blurred():
+    """One Lambert plane under a constant sky has no noise, so that a denoiser has nothing to change."""
+    plane = gi.Scene([gi.Node("wall", [quad(-2.0, 9.0, checkered())])], environment=(0.3, 0.4, 0.5))
+    scheduler = gi.FrameScheduler(plane, sideways(), gi.Pipeline(spp=4, denoise=SpatioTemporal()))
+    for index in (0, 1):
+        frame = scheduler.frame(index)
+        assert np.ptp(frame.numpy("noisy")[..., 0]) > 0.1
+        assert np.allclose(frame.numpy("beauty"), frame.numpy("noisy"), rtol=1e-4)
+
+
+@pytest.mark.parametrize("hysteresis", [0.98, 0.5])
+def test_still_view_is_the_exponential_average(hysteresis):
+    settings = SpatioTemporal(diffuse_hysteresis=hysteresis, **NO_BLUR)
+    scheduler = gi.FrameScheduler(scene(), still(), gi.Pipeline(spp=1, denoise=settings))
+    mean = 0.0
+    for index in range(8):
+        frame = scheduler.frame(index)
+        weight = max(1 - hysteresis, 1 / (index + 1))
+        mean = (1 - weight) * mean + weight * frame.numpy("noisy")
+        assert np.allclose(frame.numpy("beauty"), mean, rtol=1e-3, atol=1e-3)
+    assert lengths(scheduler)[frame.numpy("object_id") >= 0].min() == pytest.approx(8)
+
+
+def test_still_view_converges_without_bias():
+    """At pixel centres: what camera samples do at outlines and in textures is no light, and stays."""
+    reference = next(gi.render(scene(), still(), gi.Pipeline(spp=1024, camera_samples=1), seed=8))
+    light = reference.numpy("beauty") - reference.numpy("emission")
+    scheduler = gi.FrameScheduler(scene(), still(), gi.Pipeline(spp=2, camera_samples=1, denoise="spatiotemporal"))
+    errors = []
+    for index in range(48):
+        frame = scheduler.frame(index)
+        errors.append(gi.metrics.rmse(frame.numpy("beauty") - frame.numpy("emission"), light))
+    noisy = gi.metrics.rmse(frame.numpy("noisy") - frame.numpy("emission"), light)
+    assert errors[0] < 0.6 * noisy
+    assert errors[47] < 0.75 * errors[7] < 0.75 * errors[0], errors
+    found = (frame.numpy("beauty") - frame.numpy("emission")).mean((0, 1))
+    assert np.allclose(found, light.mean((0, 1)), rtol=0.02)
+
+
+@pytest.mark.parametrize("moves", ["camera", "card"])
+def test_no_history_from_other_objects(moves):
+    """The average before is replaced by a number for each object: a pixel may only meet that of its own."""
+    shot = scene()
+    if moves == "card":
+        shot.animate("card", [gi.Keyframe(0.0), gi.Keyframe(1.0, translation=(0.6, 0.0, 0.3))])
+    path = sideways(0.8) if moves == "camera" else gi.CameraPath(still().keys, fps=1, resolution=SIZE)
+    scheduler = gi.FrameScheduler(shot, path, gi.Pipeline(spp=4, denoise="spatiotemporal"))
+    scheduler.frame(0)
+    state = scheduler.state("denoise")
+    state.average.diffuse.assign(np.repeat(1e4 * state.guides.guide_object.numpy()[:, None], 3, 1))
+    frame = scheduler.frame(1)
+    state, length = scheduler.state("denoise"), lengths(scheduler).ravel()
+    objects, average = state.guides.guide_object.numpy(), state.average.diffuse.numpy()
+    assert np.array_equal(np.unique(length), [1, 2])
+    seen = length == 2
+    assert np.abs(average[seen] / 1e4 - 0.5 * objects[seen, None]).max() < 0.01
+    assert np.abs(average[~seen]).max() < 100
+    card = shot.object_names.index("card")
+    new = ~seen & (objects > 0)
+    assert new.sum() >= 10 and (objects[new] == shot.object_names.index("wall") + 1).mean() > 0.6
+    assert seen[frame.numpy("object_id").ravel() == card].mean() > 0.8
+
+
+def test_cuts_start_anew():
+    shot = scene()
+    scheduler = gi.FrameScheduler(shot, still(), gi.Pipeline(spp=1, denoise="spatiotemporal"))
+
+    def longest(index, previous=None):
+        scheduler.frame(index, previous)
+        return lengths(scheduler).max()
+
+    assert [longest(0), longest(1), longest(2)] == [1, 2, 3]
+    assert [longest(2), longest(3), longest(7), longest(8)] == [1, 2, 1, 2]
+    assert [longest(12, 8), longest(14, 13)] == [3, 1]
+    assert longest(15) == 2
+    shot.environment = (0.5, 0.5, 0.5)
+    assert [longest(16), longest(17)] == [1, 2]
+    scheduler.camera = scheduler.camera.at_resolution(20, 12)
+    scheduler.frame(18)
+    assert set(scheduler.state("denoise").average.length.numpy()) == {1}
+
+
+def test_threads_do_not_change_a_bit():
+    frames = []
+    for threads in (1, 2):
+        launch.set_threads(threads)
+        frames.append(list(gi.render(scene(), sideways(), gi.Pipeline(spp=2, denoise="spatiotemporal"), [0, 1])))
+    launch.set_threads(None)
+    for one, other in zip(*frames, strict=True):
+        for name in one.names:
+            assert np.array_equal(one.numpy(name), other.numpy(name), equal_nan=True), name
+
+
+@dataclass(frozen=True)
+class Apart(gi.BsdfPaths):
+    """Indirect light that comes in apart: ``diffuse`` alike everywhere, and random ``glossy`` light."""
+
+    diffuse: float = 0.0
+    glossy: float = 0.0
+
+    def trace(self, frame, state):
+        """Add both to the term and to the lobes."""
+        incident, glossy = frame.lobes()
+        guides = frame.struct(denoise.Guides)
+        rng = np.random.default_rng(frame.seed)
+        comes = np.full((SIZE[0] * SIZE[1], 3), self.diffuse)
+        leaves = self.glossy * rng.random((len(comes), 3)) * (guides.guide_specular.numpy() > 0)
+        incident.assign(incident.numpy() + comes)
+        glossy.assign(glossy.numpy() + leaves)
+        frame["indirect"].assign(frame["indirect"].numpy() + guides.guide_diffuse.numpy() * comes + leaves)
+
+
+def test_lobes_that_an_estimator_hands_over():
+    view = still()
+    only = {"environment": None, "emitters": None, "spp": 1, "denoise": "spatiotemporal"}
+    frame = next(gi.render(scene(), view, gi.Pipeline(indirect=Apart(diffuse=2.0), **only)))
+    assert frame.numpy("indirect").max() > 0.5
+    assert np.allclose(frame.numpy("beauty"), frame.numpy("noisy"), rtol=1e-5, atol=1e-6)
+    metal = gi.Scene([gi.Node("wall", [quad(0.0, 9.0, checkered(1.0))])])
+    frame = next(gi.render(metal, view, gi.Pipeline(indirect=Apart(glossy=1.0), **only)))
+    inner = (slice(4, -4), slice(4, -4))
+    spread = [frame.numpy(name)[inner].std() for name in ("noisy", "beauty")]
+    assert 0 < spread[1] < spread[0]
+    assert frame.numpy("beauty").mean() == pytest.approx(frame.numpy("noisy").mean(), rel=0.1)
+    for other in (None, Oidn()):
+        plain = gi.Pipeline(spp=1, denoise=other)
+        if other is None:
+            assert next(gi.render(scene(), view, plain)).lobes() is None
+        else:
+            assert not other.wants_lobes
+
+
+@pytest.fixture(scope="module")
+def moving():
+    """By built-in scene: the light of frame 7 at 512 spp, and frames 0 to 7 at 2 spp, of moving cameras."""
+    found = {}
+    for name in ("cornell_box", "atrium"):
+        shot, path = gi.builtin_scene(name), gi.builtin_camera_path(name).at_resolution(64, 36)
+        reference = next(gi.render(shot, path, gi.Pipeline(spp=512, camera_samples=64), [7], seed=9))
+        frames = list(gi.render(shot, path, gi.Pipeline(spp=2, denoise="spatiotemporal"), range(8)))
+        found[name] = reference.numpy("beauty") - reference.numpy("emission"), frames
+    return found
+
+
+def light_error(frame, reference, buffer):
+    return gi.metrics.rmse(frame.numpy(buffer) - frame.numpy("emission"), reference)
+
+
+@pytest.mark.parametrize("name, share", [("cornell_box", 0.4), ("atrium", 0.5)])
+def test_less_error_than_the_noise(moving, name, share):
+    reference, frames = moving[name]
+    noisy, denoised = (light_error(frames[-1], reference, buffer) for buffer in ("noisy", "beauty"))
+    assert denoised < share * noisy, (denoised, noisy)
+    terms = [frames[-1].numpy(term) for term in ("emission", "environment", "emitters", "indirect")]
+    assert np.array_equal(((terms[0] + terms[1]) + terms[2]) + terms[3], frames[-1].numpy("noisy"))
+
+
+@pytest.mark.parametrize("name", ["cornell_box", "atrium"])
+def test_oidn(moving, name):
+    pytest.importorskip("pyoidn")
+    reference, frames = moving[name]
+    frame, denoiser = frames[-1], Oidn()
+    denoiser.apply(frame, denoiser.start(CPU))
+    assert light_error(frame, reference, "beauty") < 0.5 * light_error(frame, reference, "noisy")
+
+
+def test_oidn_as_part_of_a_pipeline():
+    pytest.importorskip("pyoidn")
+    frame = next(gi.render(scene(), still(), gi.Pipeline(spp=1, denoise="oidn")))
+    assert "denoise" in frame.timings and frame.metadata["pipeline.denoise.quality"] == "high"
+    sky = frame.numpy("object_id") < 0
+    assert np.array_equal(frame.numpy("beauty")[sky], frame.numpy("noisy")[sky]) or not sky.any()
+    assert not np.array_equal(frame.numpy("beauty"), frame.numpy("noisy"))
+
+
+def test_oidn_that_is_not_installed(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    with pytest.raises(OptionError, match=r"pip install 'warp-gi\[denoise\]'"):
+        gi.FrameScheduler(scene(), still(), gi.Pipeline(denoise="oidn"))
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: gi.Pipeline(denoise="spatiotemprl"), "unknown denoiser .* did you mean 'spatiotemporal'"),
+        (lambda: gi.Pipeline(denoise=gi.PowerLights()), "denoise must be a Denoiser"),
+        (lambda: Oidn(quality="best"), "unknown quality 'best'"),
+        (lambda: SpatioTemporal(diffuse_radius=-1), "diffuse_radius must be from 0 to 64"),
+        (lambda: SpatioTemporal(glossy_radius=1000), "glossy_radius"),
+        (lambda: SpatioTemporal(diffuse_stride=0), "diffuse_stride must be at least 1"),
+        (lambda: SpatioTemporal(glossy_hysteresis=1.0), "glossy_hysteresis must be at least 0 and below 1"),
+        (lambda: SpatioTemporal(plane_distance=0.0), "plane_distance must be above 0"),
+        (lambda: SpatioTemporal(normal_power=float("nan")), "normal_power"),
+        (lambda: SpatioTemporal(shrink=2.0), "shrink must be from 0 to 1"),
+    ],
+)
+def test_bad_settings_are_one_line(make, words):
+    with pytest.raises(OptionError, match=words) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+def test_files_and_flags(tmp_path):
+    from warp_gi import cli
+    from warp_gi.cli_render import pipeline_named
+
+    assert pipeline_named("direct,denoise=SpatioTemporal").denoise == SpatioTemporal()
+    assert pipeline_named("path,denoise=none").denoise is None
+    command = ["render", "cornell_box", "--resolution", "24x16", "--spp", "2", "--frames", "0-1", "--quiet"]
+    command += ["--denoise", "spatiotemporal", "--denoise.diffuse-radius", "6", "-o", str(tmp_path / "a.####.exr")]
+    assert cli.main(command) == 0
+    first, second = (gi.read_frame(tmp_path / f"a.{i:04d}.exr") for i in (0, 1))
+    assert second.metadata["pipeline.denoise.diffuse_radius"] == 6
+    assert second.numpy("noisy").std() > second.numpy("beauty").std() > 0
+    (tmp_path / "a.0000.exr").unlink()
+    assert cli.main([*command, "--resume"]) == 0  # all frames: the second goes by the first
+    again = [gi.read_frame(tmp_path / f"a.{i:04d}.exr") for i in (0, 1)]
+    for one, other in zip((first, second), again, strict=True):
+        assert np.array_equal(one.numpy("beauty"), other.numpy("beauty"))

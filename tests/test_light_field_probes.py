@@ -1,0 +1,394 @@
+"""The estimator of light field probes: what is baked, how it is read, and what reaches the picture."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_gi as gi
+from warp_gi import launch
+from warp_gi.bench.presets import light, quad, sphere
+from warp_gi.kernels import light_field as field_kernels
+from warp_gi.kernels import light_field_bake as bake_kernels
+from warp_gi.techniques.light_field_state import ProbeState, lit_data, low_directions, probe_grid
+
+wp.set_module_options({"enable_backward": False})
+
+CPU = launch.get_device("cpu")
+SMALL = {"counts": (2, 2, 2), "resolution": 32, "irradiance_resolution": 16, "rays": 1}
+
+
+def walls(material, size=2.0):
+    """The six sides of a cube about the origin, fronts inward."""
+    h, e = size / 2, size
+    corners = (
+        ((-h, -h, h), (e, 0, 0), (0, 0, -e)),
+        ((-h, h, -h), (e, 0, 0), (0, 0, e)),
+        ((-h, -h, -h), (e, 0, 0), (0, e, 0)),
+        ((h, -h, h), (-e, 0, 0), (0, e, 0)),
+        ((-h, -h, h), (0, 0, -e), (0, e, 0)),
+        ((h, -h, -h), (0, 0, e), (0, e, 0)),
+    )
+    return [quad(*corner, material, f"wall{i}") for i, corner in enumerate(corners)]
+
+
+def room(albedo, emission, *more, **scene):
+    material = gi.Material("wall", (albedo,) * 3, specular=0.0, emission=(emission,) * 3)
+    return gi.Scene([gi.Node("room", [*walls(material), *more])], name="room", **scene)
+
+
+def lamp_room(*more, albedo=0.6, **scene):
+    lamp = quad((-0.3, 0.95, -0.3), (0.6, 0, 0), (0, 0, 0.6), light((8.0, 6.0, 4.0)), "lamp")
+    return room(albedo, 0.0, lamp, *more, **scene)
+
+
+def view(resolution=(24, 16)):
+    return gi.Camera.look_at((0.1, 0.1, 0.7), (0, -0.1, -1), hfov=70, resolution=resolution)
+
+
+def indirect_only(spp=1, **settings):
+    return gi.Pipeline(environment=None, emitters=None, indirect=gi.LightFieldProbes(**settings), spp=spp)
+
+
+def indirect(scene, camera=None, spp=1, bakes=(), frames=1, seed=1, **settings):
+    scheduler = gi.FrameScheduler(scene, camera or view(), indirect_only(spp, **settings), seed=seed, bakes=bakes)
+    return [scheduler.frame(index).numpy("indirect") for index in range(frames)][-1]
+
+
+# ---- texels ----
+
+
+@wp.kernel
+def repack(
+    first: wp.int32,
+    colors: wp.array(dtype=wp.vec3),
+    distances: wp.array(dtype=wp.float32),
+    normals: wp.array(dtype=wp.vec3),
+):
+    i = first + wp.tid()
+    colors[i] = field_kernels.unpack_radiance(field_kernels.pack_radiance(colors[i]))
+    surfel = field_kernels.pack_surfel(distances[i], normals[i])
+    distances[i] = field_kernels.surfel_distance(surfel)
+    normals[i] = field_kernels.surfel_normal(surfel)
+
+
+def test_texels_keep_radiance_distance_and_normal():
+    rng = np.random.default_rng(1)
+    count = 20000
+    colors = (10 ** rng.uniform(-3, 4.5, (count, 1)) * rng.random((count, 3))).astype(np.float32)
+    distances = (10 ** rng.uniform(-3, 4.8, count)).astype(np.float32)
+    normals = rng.normal(size=(count, 3)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    colors[0], colors[1], distances[:2] = 0, 1e9, (np.inf, 0)
+    normals[:6] = np.concatenate([np.eye(3), -np.eye(3)])
+    arrays = [wp.array(v, dtype=t, device=CPU) for v, t in ((colors, wp.vec3), (distances, float), (normals, wp.vec3))]
+    launch.launch(repack, count, arrays, CPU)
+    got_colors, got_distances, got_normals = (array.numpy() for array in arrays)
+    error = np.abs(got_colors - colors).max(axis=1) / np.maximum(colors.max(axis=1), 1e-9)
+    assert error[2:].max() < 1 / 500 and not got_colors[0].any() and got_colors[1].min() == 65408
+    with np.errstate(over="ignore"):
+        halves = distances.astype(np.float16).astype(np.float32)
+    halves[np.isinf(halves)] = np.where(np.isinf(distances[np.isinf(halves)]), 65536, 65504)
+    np.testing.assert_array_equal(got_distances, halves)
+    assert np.degrees(np.arccos(np.clip((got_normals * normals).sum(axis=1), -1, 1))).max() < 1.0
+    np.testing.assert_allclose(got_normals[:6], normals[:6], atol=1e-6)  # walls and floors are stored as they are
+
+
+def test_solid_angles_of_texels_fill_the_sphere():
+    for resolution in (16, 64):
+        table = low_directions(resolution).astype(np.float64)
+        np.testing.assert_allclose(np.linalg.norm(table[:, :3], axis=1), 1, atol=1e-6)
+        np.testing.assert_allclose(table[:, 3].sum(), 4 * np.pi, rtol=30 / resolution**2)
+        np.testing.assert_allclose((table[:, :3] * table[:, 3:]).sum(axis=0), 0, atol=1e-5)
+
+
+# ---- the grid ----
+
+
+def test_grid_follows_counts_and_spacing():
+    bounds = np.array([[0, 0, 0], [8, 2, 4]], np.float32)
+    assert probe_grid(bounds, (3, 1, 2), 0.0, 16).counts == (3, 1, 2)
+    assert probe_grid(bounds, (0, 0, 0), 1.0, 16).counts == (8, 2, 4)
+    assert probe_grid(bounds, (5, 0, 0), 1.0, 16).counts == (5, 2, 4)
+    automatic = probe_grid(bounds, (0, 0, 0), 0.0, 16)
+    assert 40 <= automatic.probe_count <= 90 and min(automatic.counts) >= 2
+    positions = automatic.positions()
+    assert (positions > bounds[0]).all() and (positions < bounds[1]).all()
+    np.testing.assert_allclose(positions.mean(axis=0), [4, 1, 2])
+    assert (np.diff(positions[: automatic.counts[0], 0]) > 0).all()  # x is fastest
+    with pytest.raises(gi.OptionError, match=r"probes of 1024 x 1024 texels are more than"):
+        probe_grid(bounds, (0, 0, 0), 0.01, 1024)
+
+
+def test_probes_inside_of_something_are_left_out_or_moved():
+    block = sphere((0.5, 0.5, 0.5), 0.42, gi.Material("block", (0.5, 0.5, 0.5), specular=0.0))
+    scene = lamp_room(block)
+    kept = gi.bake(scene, gi.LightFieldProbes(**SMALL, relocate=False)).arrays
+    assert kept["states"].tolist() == [0] * 7 + [1]
+    moved = gi.bake(scene, gi.LightFieldProbes(**SMALL, relocate=True)).arrays
+    assert not moved["states"].any()
+    home, place = kept["positions"][7], moved["positions"][7]
+    assert np.linalg.norm(home - 0.5) < 0.42 < np.linalg.norm(place - 0.5) and np.abs(place).max() < 1
+    assert (np.abs(place - home) <= 0.5 * moved["grid_spacing"] + 1e-6).all()
+
+
+# ---- what probes hold ----
+
+
+def test_maps_of_an_empty_room_are_its_walls():
+    """Distances are those of a cube, normals point inward, and nothing is reflected of no light."""
+    bake = gi.bake(room(0.5, 0.0), gi.LightFieldProbes(**{**SMALL, "counts": (1, 1, 1)}, relocate=False))
+    directions = low_directions(32)[:, :3]
+    np.testing.assert_allclose(bake.arrays["positions"][0], 0, atol=1e-6)
+    expected = 1 / np.abs(directions).max(axis=1)
+    surfels = bake.arrays["surfels"]
+    distances = (surfels & 0x7FFF).astype(np.uint16).view(np.float16).astype(np.float64)
+    np.testing.assert_allclose(distances, expected, rtol=1e-3)
+    assert not bake.arrays["radiance"].any() and not bake.arrays["irradiance"].any()
+
+
+@pytest.mark.parametrize("albedo", [0.3, 0.7])
+def test_white_furnace_converges_to_the_geometric_series(albedo):
+    """Walls of emission 1: a / (1 - a) is reflected, and a times that is the indirect term."""
+    scene = room(albedo, 1.0)
+    settings = {**SMALL, "bounces": 200, "tolerance": 1e-4, "rays": 4}
+    bake = gi.bake(scene, gi.LightFieldProbes(**settings))
+    reflected = albedo / (1 - albedo)
+    np.testing.assert_allclose(bake.arrays["irradiance"], np.pi * reflected, rtol=0.02)
+    for mode in ("irradiance", "traced"):
+        image = indirect(scene, spp=4, bakes=[bake], mode=mode, **settings)
+        assert abs(image.mean() / (albedo * reflected) - 1) < 0.02
+
+
+def test_energy_never_grows_from_bounce_to_bounce():
+    bake = gi.bake(lamp_room(albedo=0.9), gi.LightFieldProbes(**SMALL, bounces=12, tolerance=0.0))
+    changes = [bake.counts[f"change_{number}"] for number in range(1, 13)]
+    assert changes[0] == 1 and (np.diff(changes) < 0).all() and changes[-1] > 0
+
+
+def test_filters_keep_constants():
+    """Moments of a constant distance are that distance and its square; irradiance of constant light is pi times it."""
+    scene = room(0.5, 1.0)
+    settings = gi.LightFieldProbes(**{**SMALL, "counts": (1, 1, 1)}, bounces=1)
+    state = ProbeState(scene, CPU, settings, 1)
+    work = state._work(np.array([0]), 1, scene, with_emission=False)
+    state._trace(lit_data(scene, CPU), work, np.array([0]))
+    work.light.fill_(wp.vec3(0.25, 0.5, 4.0))
+    work.distances.fill_(wp.vec2(1.5, 2.25))
+    size = settings.irradiance_resolution**2
+    for kernel in (bake_kernels.filter_light, bake_kernels.filter_distances):
+        launch.launch(kernel, size, [state.field, work], CPU)
+    np.testing.assert_allclose(state.field.irradiance.numpy(), np.pi * np.array([[0.25, 0.5, 4.0]] * size), rtol=1e-5)
+    np.testing.assert_allclose(state.field.moments.numpy(), [[1.5, 2.25]] * size, rtol=1e-5)
+
+
+def test_emission_is_kept_apart():
+    scene = lamp_room()
+    bake = gi.bake(scene, gi.LightFieldProbes(**SMALL))
+    texels = bake.arrays["emission_texels"]
+    assert len(texels) and (np.diff(texels) > 0).all()
+    assert (bake.arrays["surfels"][texels] >> 15 & 1).all()
+    assert (bake.arrays["surfels"] >> 15 & 1).sum() == len(texels)
+    dark = gi.bake(room(0.5, 0.0), gi.LightFieldProbes(**SMALL))
+    assert not len(dark.arrays["emission_texels"])
+
+
+# ---- what is read between probes ----
+
+
+@wp.kernel
+def weigh(
+    first: wp.int32,
+    field: field_kernels.LightField,
+    positions: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    light: wp.array(dtype=wp.vec3),
+):
+    i = first + wp.tid()
+    light[i] = field_kernels.irradiance_at(field, positions[i], normals[i])
+
+
+@pytest.mark.parametrize("weights", ["visibility", "trilinear"])
+def test_weights_sum_to_one(weights):
+    """Where all probes agree, what is read is what they say, everywhere in the room and whatever sees what."""
+    block = sphere((0.3, -0.2, 0.1), 0.4, gi.Material("block", (0.5, 0.5, 0.5), specular=0.0))
+    settings = gi.LightFieldProbes(**SMALL, weights=weights)
+    scene = lamp_room(block)
+    state = ProbeState(scene, CPU, settings, 1, gi.bake(scene, settings))
+    state.field.irradiance.fill_(wp.vec3(1.0, 2.0, 3.0))
+    rng = np.random.default_rng(2)
+    normals = rng.normal(size=(2000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    arrays = [wp.array(v.astype("f4"), dtype=wp.vec3, device=CPU) for v in (rng.uniform(-0.9, 0.9, (2000, 3)), normals)]
+    light = wp.zeros(2000, dtype=wp.vec3, device=CPU)
+    launch.launch(weigh, 2000, [state.field, *arrays, light], CPU)
+    values = light.numpy()
+    outside = np.linalg.norm(arrays[0].numpy() - [0.3, -0.2, 0.1], axis=1) > 0.45
+    seen = values.any(axis=1)
+    assert seen[outside].mean() > 0.99
+    np.testing.assert_allclose(values[seen], [[1, 2, 3]] * int(seen.sum()), rtol=1e-5)
+
+
+def test_light_does_not_leak_into_the_dark_room():
+    """Visibility keeps the dark room of two dark, where plain trilinear weights light it."""
+    scene = gi.builtin_scene("two_rooms")
+    means = {}
+    for weights in ("visibility", "trilinear"):
+        settings = {"weights": weights, "resolution": 64, "rays": 1, "mode": "irradiance", "counts": (8, 3, 4)}
+        bake = gi.bake(scene, gi.LightFieldProbes(**settings), seed=1)
+        for name in ("lit", "dark"):
+            camera = scene.cameras[name].at_resolution(48, 32)
+            means[weights, name] = float(indirect(scene, camera, bakes=[bake], **settings).mean())
+    assert means["visibility", "dark"] < 0.01 * means["visibility", "lit"]
+    assert means["trilinear", "dark"] > 0.1 * means["trilinear", "lit"]
+
+
+def test_modes_agree_with_the_path_tracer():
+    """The error of each mode in a simple room is small, and falls as there are more probes."""
+    scene = lamp_room()
+    camera = view((32, 24))
+    paths = gi.Pipeline(environment=None, emitters=None, indirect=gi.BsdfPaths(max_depth=20), spp=1024)
+    reference = next(gi.render(scene, camera, paths, seed=5)).numpy("indirect")
+    errors = {}
+    for mode in ("irradiance", "traced"):
+        for count in (2, 4):
+            settings = {**SMALL, "counts": (count,) * 3, "resolution": 64, "mode": mode, "rays": 4}
+            image = indirect(scene, camera, spp=256, **settings)
+            errors[mode, count] = gi.metrics.rmse(image, reference) / reference.mean()
+            assert abs(image.mean() / reference.mean() - 1) < 0.12 / (count / 2) ** 0.5, (mode, count)
+    assert errors["irradiance", 2] < 0.2 and errors["irradiance", 4] < 0.8 * errors["irradiance", 2]
+    assert errors["traced", 2] < 0.1 and errors["traced", 4] < 0.1
+
+
+def test_glossy_surfaces_reflect_what_probes_saw():
+    """A mirror shows the room's lit floor; the mode "irradiance" cannot."""
+    mirror = quad((-0.8, -0.8, -0.95), (1.6, 0, 0), (0, 1.6, 0), gi.Material("m", (1, 1, 1), metallic=1, roughness=0.1))
+    scene, camera = lamp_room(mirror), view((32, 24))
+    paths = gi.Pipeline(environment=None, emitters=None, indirect=gi.BsdfPaths(max_depth=12), spp=512)
+    frame = next(gi.render(scene, camera, paths, seed=5))
+    on_mirror = frame.numpy("albedo")[..., 0] > 0.95
+    reference = frame.numpy("indirect")[on_mirror]
+    settings = {**SMALL, "resolution": 128, "rays": 4}
+    errors = {
+        mode: gi.metrics.rmse(indirect(scene, camera, spp=64, mode=mode, **settings)[on_mirror], reference)
+        for mode in ("irradiance", "hybrid", "traced")
+    }
+    assert max(errors["hybrid"], errors["traced"]) < 0.5 * errors["irradiance"], errors
+
+
+# ---- frames ----
+
+
+def test_threads_do_not_change_a_bit():
+    scene = lamp_room()
+    results = []
+    for threads in (1, 2):
+        gi.set_threads(threads)
+        try:
+            bake = gi.bake(scene, gi.LightFieldProbes(**SMALL), seed=3)
+            results.append((bake.digest, indirect(scene, bakes=[bake], spp=2, mode="traced", **SMALL)))
+        finally:
+            gi.set_threads(None)
+    assert results[0][0] == results[1][0]
+    np.testing.assert_array_equal(results[0][1], results[1][1])
+
+
+def test_a_saved_bake_renders_the_same_and_fits_only_its_scene(tmp_path):
+    scene = lamp_room(environment=(0.2, 0.2, 0.2))
+    bake = gi.bake(scene, gi.LightFieldProbes(**SMALL), seed=1)
+    loaded = gi.load_bake(bake.save(tmp_path / "room.probes.safetensors"))
+    assert loaded.digest == bake.digest
+    np.testing.assert_array_equal(indirect(scene, bakes=[loaded], **SMALL), indirect(scene, **SMALL))
+    with pytest.raises(gi.BakeError, match="bake it again"):
+        indirect(lamp_room(albedo=0.5, environment=(0.2, 0.2, 0.2)), bakes=[loaded], **SMALL)
+    with pytest.raises(gi.BakeError, match="sky: bake has"):
+        indirect(lamp_room(environment=(0.9, 0.2, 0.2)), bakes=[loaded], **SMALL)
+    with pytest.raises(gi.BakeError, match="counts: bake has '2x2x2', asked for '3x2x2'"):
+        indirect(scene, bakes=[loaded], **{**SMALL, "counts": (3, 2, 2)})
+
+
+def test_a_still_scene_settles_and_a_changed_sky_is_followed():
+    """A few frames after the sky changed, probes are where a new bake would be; then nothing more is traced."""
+    settings = {**SMALL, "resolution": 64, "update": 4, "hysteresis": 0.3, "mode": "irradiance"}
+    camera = gi.Camera.look_at((0, 1.5, 1.5), (0, -1, 0), hfov=60, resolution=(16, 12))
+    ball = sphere((0, -0.4, 0), 0.3, gi.Material("ball", (0.8,) * 3, specular=0.0))
+    floor = walls(gi.Material("floor", (0.5,) * 3, specular=0.0))[0]
+    open_room = gi.Scene([gi.Node("all", [floor, ball])], environment=(0.5, 0.5, 0.5))
+    scheduler = gi.FrameScheduler(open_room, camera, indirect_only(**settings), seed=1)
+    before = scheduler.frame(0).numpy("indirect")
+    assert scheduler.state("indirect").refreshes == 0
+    open_room.environment = (1.5, 1.5, 1.5)
+    for index in range(1, 9):
+        after = scheduler.frame(index).numpy("indirect")
+    settled = scheduler.state("indirect").refreshes
+    scheduler.frame(9)
+    assert scheduler.state("indirect").refreshes == settled == 8  # 8 probes, 4 a frame, 4 times each
+    assert abs(after.mean() / (3 * before.mean()) - 1) < 0.05
+
+
+def test_a_lamp_that_moves_takes_its_light_along():
+    lamp = quad((-0.2, 0.95, -0.2), (0.4, 0, 0), (0, 0, 0.4), light((9.0, 9.0, 9.0)), "lamp")
+    keys = [gi.Keyframe(0.0, (-0.7, 0, 0)), gi.Keyframe(1 / 24, (0.7, 0, 0))]
+    wall = gi.Material("wall", (0.6,) * 3, specular=0.0)
+    scene = gi.Scene([gi.Node("room", walls(wall)), gi.Node("lamp", [lamp], keyframes=keys)])
+    path = gi.CameraPath.from_cameras([view((32, 8))] * 8)
+    settings = {**SMALL, "update": 8, "hysteresis": 0.0, "mode": "irradiance"}
+    scheduler = gi.FrameScheduler(scene, path, indirect_only(**settings), seed=1)
+    first, last = scheduler.frame(0).numpy("indirect"), [scheduler.frame(i) for i in range(1, 8)][-1].numpy("indirect")
+    sides = lambda image: (image[:, :8].mean(), image[:, -8:].mean())  # noqa: E731
+    assert sides(first)[0] > 1.1 * sides(first)[1] and sides(last)[1] > 1.1 * sides(last)[0]
+
+
+def test_light_falls_on_moving_objects():
+    ball = sphere((0, 0, 0), 0.2, gi.Material("ball", (0.8,) * 3, specular=0.0))
+    keys = [gi.Keyframe(0.0, (-0.3, 0, -0.3)), gi.Keyframe(1.0, (0.3, 0, -0.3))]
+    base = lamp_room()
+    scene = gi.Scene([*base.nodes, gi.Node("ball", [ball], keyframes=keys)])
+    path = gi.CameraPath.from_cameras([view()] * 24)
+    for mode in ("irradiance", "hybrid", "traced"):
+        scheduler = gi.FrameScheduler(scene, path, indirect_only(4, **SMALL, mode=mode, update=0), seed=1)
+        frame = scheduler.frame(12)
+        on_ball = frame.numpy("object_id") == scene.object_names.index("ball")
+        assert on_ball.any() and frame.numpy("indirect")[on_ball].min(axis=0).max() > 0
+
+
+def test_variance_knows_the_noise_of_traced_rays():
+    scene = lamp_room()
+    steady = gi.FrameScheduler(scene, view(), indirect_only(8, **SMALL, mode="irradiance"), seed=1).frame(0)
+    noisy = gi.FrameScheduler(scene, view(), indirect_only(8, **SMALL, mode="traced"), seed=1).frame(0)
+    assert noisy.numpy("variance").mean() > 10 * steady.numpy("variance").mean()
+
+
+def test_fewer_rays_a_pixel_have_the_same_mean():
+    scene = lamp_room()
+    many = indirect(scene, spp=64, mode="traced", **SMALL)
+    few = indirect(scene, spp=64, mode="traced", pixel_rays=8, **SMALL)
+    assert abs(few.mean() / many.mean() - 1) < 0.02 and not np.array_equal(few, many)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"mode": "magic"}, "mode of light field probes"),
+        ({"resolution": 100}, "multiple of 16"),
+        ({"resolution": 2048}, "from 16 to 1024"),
+        ({"counts": (2, 2)}, "three whole numbers"),
+        ({"counts": (2, 2, -1)}, "counts must be"),
+        ({"spacing": float("nan")}, "spacing must be"),
+        ({"spacing": 1.0, "counts": (2, 2, 2)}, "contradict"),
+        ({"hysteresis": 1.0}, "hysteresis must be"),
+        ({"tolerance": -0.1}, "tolerance must be"),
+        ({"irradiance_resolution": 256}, "from 4 to 128"),
+    ],
+)
+def test_settings_are_checked(settings, words):
+    with pytest.raises(gi.OptionError, match=words):
+        gi.LightFieldProbes(**settings)
+
+
+def test_preset_and_defaults():
+    pipeline = gi.Pipeline.preset("probes", spp=4)
+    assert isinstance(pipeline.indirect, gi.LightFieldProbes)
+    assert replace(pipeline.indirect, mode="traced").mode == "traced"
+    assert pipeline.describe()["indirect.resolution"] == 256

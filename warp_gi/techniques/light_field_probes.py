@@ -1,0 +1,184 @@
+"""Light field probes: indirect light from octahedral maps that know what they see (light_field_probes.txt)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from warp_gi import launch
+from warp_gi.baking import Bake
+from warp_gi.camera import Camera, CameraPath
+from warp_gi.errors import OptionError, unknown_name
+from warp_gi.estimator import Estimator
+from warp_gi.kernels import light_field as field_kernels
+from warp_gi.kernels import light_field_trace as trace_kernels
+from warp_gi.techniques.light_field_state import ProbeState, lit_data
+
+_MODES = {
+    "irradiance": trace_kernels.MODE_IRRADIANCE,
+    "hybrid": trace_kernels.MODE_HYBRID,
+    "traced": trace_kernels.MODE_TRACED,
+}
+_PRIMARIES = ("geometry", "probes")
+_WEIGHTS = ("visibility", "trilinear")
+MOST_RESOLUTION = 1024
+SETTLED = 0.02
+"""Share of an old state that may be left in the irradiance when a probe counts as refreshed."""
+
+
+@dataclass(frozen=True)
+class LightFieldProbes(Estimator):
+    """Indirect light from a grid of probes that hold radiance, normals and distances all around.
+
+    Biased: by how many probes there are, how finely they look, and by what a probe cannot see. (McGuire et al. 2017,
+    "Real-Time Global Illumination using Precomputed Light Field Probes".)
+    """
+
+    term: ClassVar[str] = "indirect"
+
+    mode: Literal["irradiance", "hybrid", "traced"] = "hybrid"
+    """"irradiance" reads filtered irradiance and has no noise; "hybrid" does so for the diffuse part and traces rays
+    through the probes for the glossy one; "traced" traces rays for all."""
+    counts: tuple[int, int, int] = (0, 0, 0)
+    """Probes along x, y and z; 0 follows from the spacing."""
+    spacing: float = 0.0
+    """Metres between probes; 0 makes about 64 of them."""
+    resolution: int = 256
+    """Texels along a side of a probe's map, a multiple of 16."""
+    irradiance_resolution: int = 32
+    """Texels along a side of its map of irradiance; the paper has 32 to 128."""
+    rays: int = 4
+    """Rays a texel while baking."""
+    bounces: int = 16
+    """Most passes of light from probes to probes; the first is light that was reflected once."""
+    tolerance: float = 0.005
+    """Relative change of the irradiance below which light bounces no more."""
+    relocate: bool = True
+    """Move probes out of walls, or away from them, by up to half the distance to the next."""
+    weights: Literal["visibility", "trilinear"] = "visibility"
+    """"trilinear" blends the eight probes around a point as if all of them saw it, to compare with."""
+    pixel_rays: int = 0
+    """Rays a pixel in the modes "hybrid" and "traced", at least one a camera sample; 0 is one for each of the
+    pipeline's samples."""
+    update: int = 8
+    """Probes that are refreshed each frame, when the sky turned or something moved."""
+    hysteresis: float = 0.5
+    """Share of its old irradiance that a refreshed probe keeps."""
+    primary: Literal["geometry", "probes"] = "geometry"
+    """"probes" traces the camera's rays through the probes too: no geometry is needed, a bake is enough."""
+
+    def validate(self) -> None:
+        """Raise OptionError for settings out of range."""
+        for name, value, known in (
+            ("mode", self.mode, _MODES),
+            ("primary", self.primary, _PRIMARIES),
+            ("weights", self.weights, _WEIGHTS),
+        ):
+            if value not in known:
+                raise unknown_name(f"{name} of light field probes", value, known)
+        block = int(field_kernels.BLOCK)
+        for name, least, most in (
+            ("resolution", block, MOST_RESOLUTION),
+            ("irradiance_resolution", 4, 128),
+            ("rays", 1, 1024),
+            ("bounces", 1, 1000),
+            ("pixel_rays", 0, 1 << 20),
+            ("update", 0, 1 << 20),
+        ):
+            _check_whole(name, getattr(self, name), least, most)
+        if self.resolution % block:
+            raise OptionError(f"resolution must be a multiple of {block}, got {self.resolution}")
+        if not isinstance(self.counts, tuple | list) or len(self.counts) != 3:
+            raise OptionError(f"counts must be three whole numbers, along x, y and z, got {self.counts!r}")
+        for count in self.counts:
+            _check_whole("counts", count, 0, 1 << 20)
+        if not (math.isfinite(self.spacing) and self.spacing >= 0):
+            raise OptionError(f"spacing must be 0 (automatic) or metres above it, got {self.spacing}")
+        if self.spacing and all(self.counts):
+            raise OptionError("spacing and counts along every axis contradict each other; give one of them")
+        if not 0 <= self.tolerance < 1:
+            raise OptionError(f"tolerance must be a share of at least 0 and below 1, got {self.tolerance}")
+        if not 0 <= self.hysteresis < 1:
+            raise OptionError(f"hysteresis must be a share of at least 0 and below 1, got {self.hysteresis}")
+
+    # ---- bake ----
+
+    def bake_key(self, scene: Any) -> str:
+        """Return the hash of geometry, materials and lights. A changed sky needs no new bake: probes adapt to it."""
+        return scene.contents_hash
+
+    def bake_settings(self, scene: Any) -> dict[str, Any]:
+        """Return the settings that decide the maps, and the sky."""
+        names = ("spacing", "resolution", "irradiance_resolution", "rays", "bounces", "tolerance", "relocate")
+        sky = "none" if scene.environment is None else scene.environment.content_hash[:16]
+        counts = "x".join(str(int(n)) for n in self.counts)
+        return {"counts": counts, "sky": sky, "weights": self.weights, **{name: getattr(self, name) for name in names}}
+
+    def bake(
+        self,
+        scene: Any,
+        device: str,
+        seed: int = 0,
+        progress: Callable[[float], None] | None = None,
+        camera: Camera | CameraPath | None = None,
+    ) -> Bake:
+        """Return the probes' maps, for the scene's sky and its pose at time 0."""
+        target = launch.get_device(device)
+        scene.update(0.0, None, target)
+        state = ProbeState(scene, target, self, seed)
+        state.bake(scene, progress)
+        return state.to_bake(scene)
+
+    def start(self, scene: Any, device: str, bake: Bake | None, seed: int = 0) -> ProbeState:
+        """Return the state of probes that hold a bake."""
+        state = ProbeState(scene, launch.get_device(device), self, seed, bake)
+        state.key = _key(scene, 0.0)
+        return state
+
+    # ---- frames ----
+
+    def preprocess(self, frame: Any, state: ProbeState) -> ProbeState:
+        """Refresh some probes, if the sky or a pose is not what they saw."""
+        key = _key(frame.scene, frame.time)
+        if key != state.key:
+            state.key = key
+            state.pending[:] = self.refreshes_to_settle
+        if self.update and state.pending.any():
+            probes = state.take_stale(self.update)
+            state.refresh(frame.scene, lit_data(frame.scene, frame.device), probes)
+        return state
+
+    @property
+    def refreshes_to_settle(self) -> int:
+        """Refreshes of a probe until what it saw before no longer counts, and light has bounced a few times."""
+        fading = math.ceil(math.log(SETTLED) / math.log(self.hysteresis)) if self.hysteresis > 0 else 1
+        return max(fading, 4)
+
+    def trace(self, frame: Any, state: ProbeState) -> None:
+        """Add the light of the current camera sample."""
+        settings = frame.pass_settings
+        query = trace_kernels.ProbeQuery()
+        query.mode = _MODES[self.mode]
+        rays = -(-self.pixel_rays // settings.camera_samples) or settings.sample_count
+        query.rays, query.share = rays, settings.sample_count / rays
+        buffers = trace_kernels.ProbeBuffers()
+        buffers.indirect = frame["indirect"]
+        buffers.moment1, buffers.moment2 = frame.moments("indirect")
+        inputs = [frame.data, frame.camera_data, settings, state.field, query, frame.hits, buffers]
+        frame.launch_tiled(trace_kernels.trace_probes, inputs)
+
+
+def _check_whole(name: str, value: object, least: int, most: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
+        raise OptionError(f"{name} must be a whole number from {least} to {most}, got {value!r}")
+
+
+def _key(scene: Any, time: float) -> str:
+    """Return what the light in the probes depends on beside geometry, materials and lights: the sky, and poses."""
+    sky = "" if scene.environment is None else scene.environment.content_hash
+    poses = [scene.world_from_node(index, time).tobytes() for index in range(len(scene.nodes)) if scene.moves(index)]
+    return sky + b"".join(poses).hex()

@@ -1,0 +1,359 @@
+"""Light field probes on a device: where they stand, how they are filled, and which are out of date."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_gi import launch
+from warp_gi.alias import AliasTable
+from warp_gi.baking import Bake
+from warp_gi.errors import OptionError
+from warp_gi.kernels import light_field as field_kernels
+from warp_gi.kernels import light_field_bake as bake_kernels
+from warp_gi.kernels import types
+from warp_gi.techniques.baselines import sky_probability
+
+AUTOMATIC_PROBES = 64
+"""About as many as there are where neither counts nor spacing are given; the paper's living room has 4 x 4 x 4."""
+INSET = 0.35
+"""Distance of the outermost probes from the border, in distances between probes: where points by a wall have a probe
+near and light is as it is in the room. At 0.5 rooms come out 5 to 10 % too bright, at 0.2 coarse grids lose light."""
+MOST_PROBES = 1 << 20
+MOST_TEXELS = (1 << 31) - 1
+"""Of all maps together: kernels count them in 32 bits."""
+LIGHT_RESOLUTION, DISTANCE_RESOLUTION = 32, 64
+"""Texels along a side of what irradiance and moments are filtered from, each the mean over the texels in it."""
+SHARING_RESOLUTION, LAST_SHARING_RESOLUTION = 64, 128
+"""Texels along a side of a map that look irradiance up for themselves, while light bounces and at last."""
+BIAS = 0.05
+"""Share of the smallest distance between probes by which a point leaves its surface before it asks who sees it."""
+CLEARANCE = 0.1
+"""Share of the smallest distance between probes that a moved probe keeps from walls."""
+COVERED_SHARE = 0.5
+"""A probe that sees back faces in more directions than this is inside of something."""
+SLABS, LOOKS = 24, 64
+"""Points along each axis, and directions from each, that find out where there is free space."""
+FREE_SHARE, SLAB_SHARE = 0.25, 0.1
+"""A point is free if it sees fewer back faces; a slab counts with this share of the free points of the best one."""
+PLACE_LOOKS = 256
+BATCH_TEXELS = 1 << 20
+"""Traced between two reports of progress."""
+
+
+@dataclass(frozen=True)
+class ProbeGrid:
+    """Where probes stand: on a regular grid over the scene."""
+
+    low: np.ndarray
+    """float64 [3], metres: probe (0, 0, 0)."""
+    spacing: np.ndarray
+    """float64 [3], metres."""
+    counts: tuple[int, int, int]
+    """Probes along x, y, z."""
+
+    @property
+    def probe_count(self) -> int:
+        """Number of probes."""
+        return math.prod(self.counts)
+
+    def positions(self) -> np.ndarray:
+        """Return float64 [probe, 3], x fastest, then y."""
+        z, y, x = np.meshgrid(*(np.arange(n) for n in self.counts[::-1]), indexing="ij")
+        return self.low + np.stack([x, y, z], axis=-1).reshape(-1, 3) * self.spacing
+
+
+def probe_grid(bounds: np.ndarray, counts: Sequence[int], spacing: float, resolution: int) -> ProbeGrid:
+    """Return the grid over ``bounds`` [2, 3] with so many probes along each axis, or so many metres between them.
+
+    Counts of 0 follow from the spacing; without either there are about 64 probes, as evenly spaced as possible.
+    Raises OptionError for more probes than can be held.
+    """
+    low, high = bounds.astype(np.float64)
+    extent = np.maximum(high - low, 1e-3 * max(float((high - low).max()), 1e-3))  # a flat scene has a little height
+    step = spacing or float(np.prod(extent) / AUTOMATIC_PROBES) ** (1 / 3)
+    least = 1 if spacing else 2  # eight probes around every point, unless told otherwise
+    found = tuple(int(n) or max(least, round(min(e / step, 1e9))) for n, e in zip(counts, extent, strict=True))
+    texels = math.prod(found) * resolution**2
+    if math.prod(found) > MOST_PROBES or texels > MOST_TEXELS:
+        raise OptionError(
+            f"{' x '.join(map(str, found))} probes of {resolution} x {resolution} texels are more than the "
+            f"{MOST_PROBES:,} probes or {MOST_TEXELS:,} texels that are supported; use fewer or smaller ones"
+        )
+    along = np.array(found)
+    cells = extent / np.where(along > 1, along - 1 + 2 * INSET, 1.0)
+    return ProbeGrid((low + high) / 2 - cells * (along - 1) / 2, cells, found)
+
+
+def free_bounds(scene: Any, data: Any, device: wp.Device) -> np.ndarray:
+    """Return the box around the space that light is in, float64 [2, 3]; the scene's bounds if faces do not tell.
+
+    Bounds of a room reach behind its walls, to lamps above the ceiling and trees before the window. Points there see
+    walls from behind. The box is that of the slabs in which enough points do not.
+    """
+    bounds = scene.bounds.astype(np.float64)
+    at = (np.arange(SLABS) + 0.5) / SLABS
+    share = np.stack(np.meshgrid(at, at, at, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = wp.array((bounds[0] + share * (bounds[1] - bounds[0])).astype(np.float32), dtype=wp.vec3, device=device)
+    backs = wp.empty(len(share), dtype=wp.float32, device=device)
+    launch.launch(bake_kernels.measure_backs, len(share), [data, points, LOOKS, backs], device, smallest_slice=16)
+    free = (backs.numpy() < FREE_SHARE).reshape(SLABS, SLABS, SLABS)
+    box = bounds.copy()
+    for axis in range(3):
+        slab = free.sum(axis=tuple(other for other in range(3) if other != axis))
+        used = np.flatnonzero(slab >= max(SLAB_SHARE * slab.max(), 1))
+        if len(used):
+            size = (bounds[1, axis] - bounds[0, axis]) / SLABS
+            box[:, axis] = bounds[0, axis] + size * np.array([used[0], used[-1] + 1])
+    return box
+
+
+def low_directions(resolution: int) -> np.ndarray:
+    """Return float32 [resolution^2, 4]: unit direction and solid angle [sr] of each texel of an octahedral map.
+
+    A point p of the octahedron's face |x| + |y| + |z| = 1 seen from the centre: an area dA of the map (of side 2, so
+    that the face lies over it with slope sqrt(3)) has dw = sqrt(3) dA cos / |p|^2 = dA / |p|^3, for the face's normal
+    (1, 1, 1) / sqrt(3) makes the angle cos = 1 / (sqrt(3) |p|) with p.
+    """
+    at = 2 * (np.arange(resolution) + 0.5) / resolution - 1
+    x, z = np.meshgrid(at, at)
+    y = 1 - np.abs(x) - np.abs(z)
+    fold = y < 0
+    sign = lambda v: np.where(v < 0, -1.0, 1.0)  # noqa: E731
+    fx, fz = np.where(fold, (1 - np.abs(z)) * sign(x), x), np.where(fold, (1 - np.abs(x)) * sign(z), z)
+    p = np.stack([fx, y, fz], axis=-1).reshape(-1, 3)
+    length = np.linalg.norm(p, axis=1, keepdims=True)
+    return np.concatenate([p / length, (2 / resolution) ** 2 / length**3], axis=1).astype(np.float32)
+
+
+class ProbeState:
+    """The probes of an estimator on a device, and how far they are behind the scene."""
+
+    def __init__(self, scene: Any, device: wp.Device, settings: Any, seed: int, bake: Bake | None = None) -> None:
+        self.device, self.settings, self.seed = device, settings, seed
+        if bake is None:
+            box = free_bounds(scene, scene.data(device), device)
+            self.grid = probe_grid(box, settings.counts, settings.spacing, settings.resolution)
+            bounds = scene.bounds
+        else:
+            arrays = bake.arrays
+            counts = tuple(int(n) for n in arrays["grid_counts"])
+            self.grid, bounds = ProbeGrid(arrays["grid_low"], arrays["grid_spacing"], counts), arrays["bounds"]
+        self.changes: list[float] = []
+        """Change of the irradiance by each bounce, as a share of it."""
+        self.key = ""
+        """Of the sky and the poses that the probes were last refreshed for."""
+        self.refreshes = 0
+        self.pending = np.zeros(self.grid.probe_count, np.int32)
+        """Refreshes that each probe still needs."""
+        self._cursor = 0
+        self.field = self._empty_field(bounds.astype(np.float64))
+        if bake is not None:
+            self._load(bake)
+
+    def _empty_field(self, bounds: np.ndarray) -> Any:
+        grid, settings = self.grid, self.settings
+        count, texels = grid.probe_count, settings.resolution**2
+        margin = 1e-3 * float(np.linalg.norm(bounds[1] - bounds[0]))
+        field = field_kernels.LightField()
+        field.low, field.spacing = wp.vec3(*grid.low), wp.vec3(*grid.spacing)
+        field.counts = wp.vec3i(*grid.counts)
+        field.resolution, field.irradiance_resolution = settings.resolution, settings.irradiance_resolution
+        field.bias = BIAS * float(grid.spacing.min())
+        field.plain = int(settings.weights == "trilinear")
+        field.bounds_low, field.bounds_high = wp.vec3(*(bounds[0] - margin)), wp.vec3(*(bounds[1] + margin))
+        field.positions = self._array(grid.positions().astype(np.float32), wp.vec3)
+        field.states = wp.zeros(count, dtype=wp.int32, device=self.device)
+        for name, dtype, size in (
+            ("radiance", wp.uint32, texels),
+            ("surfels", wp.uint32, texels),
+            ("nearest", wp.float32, (settings.resolution // int(field_kernels.BLOCK)) ** 2),
+            ("irradiance", wp.vec3, settings.irradiance_resolution**2),
+            ("moments", wp.vec2, settings.irradiance_resolution**2),
+        ):
+            setattr(field, name, wp.zeros(count * size, dtype=dtype, device=self.device))
+        field.emission_texels = wp.empty(0, dtype=wp.int32, device=self.device)
+        field.emission = wp.empty(0, dtype=wp.uint32, device=self.device)
+        return field
+
+    def _array(self, values: np.ndarray, dtype: Any) -> wp.array:
+        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
+
+    # ---- filling ----
+
+    def bake(self, scene: Any, progress: Callable[[float], None] | None = None) -> None:
+        """Place all probes, trace them, and let light bounce between them until it changes no more."""
+        settings, told = self.settings, progress or (lambda share: None)
+        data = lit_data(scene, self.device)
+        if settings.relocate:
+            most = wp.vec3(*(0.5 * self.grid.spacing))
+            clearance = CLEARANCE * float(self.grid.spacing.min())
+            inputs = [data, self.field, most, clearance, PLACE_LOOKS]
+            self._launch(bake_kernels.place_probes, self.grid.probe_count, inputs)
+        every = np.arange(self.grid.probe_count)
+        work = self._work(every, settings.rays, scene, with_emission=scene.emitter_count > 0)
+        self._trace(data, work, every, lambda share: told(0.8 * share))
+        self._find_covered(work)
+        before, self.changes = np.float64(0), []
+        for number in range(settings.bounces):
+            self._bounce(work, len(every))
+            usable = self.field.states.numpy() == int(field_kernels.PROBE_USABLE)
+            after = self.field.irradiance.numpy().reshape(self.grid.probe_count, -1)[usable].astype(np.float64)
+            self.changes.append(float(np.abs(after - before).sum() / max(np.abs(after).sum(), 1e-30)))
+            before = after
+            told(0.8 + 0.2 * (number + 1) / settings.bounces)
+            if self.changes[-1] <= settings.tolerance:
+                break
+        self._bounce(work, len(every), is_last=True)
+        self._keep_emission(work)
+        self.pending[:] = 0
+
+    def refresh(self, scene: Any, data: Any, probes: np.ndarray) -> None:
+        """Trace some probes again, and blend what they gather into their irradiance."""
+        work = self._work(probes, 1, scene, with_emission=False)
+        self._trace(data, work, probes)
+        work.hysteresis = self.settings.hysteresis
+        self._bounce(work, len(probes), is_last=True)
+        self.refreshes += 1
+
+    def take_stale(self, most: int) -> np.ndarray:
+        """Return up to ``most`` probes that need a refresh, in turns, and count it as done."""
+        stale = np.flatnonzero(self.pending)
+        stale = np.concatenate([stale[stale >= self._cursor], stale[stale < self._cursor]])[:most]
+        self.pending[stale] -= 1
+        if len(stale):
+            self._cursor = int(stale[-1]) + 1
+        return np.sort(stale)
+
+    def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any]) -> None:
+        launch.launch(kernel, count, inputs, self.device, smallest_slice=1)
+
+    def _work(self, probes: np.ndarray, rays: int, scene: Any, with_emission: bool) -> Any:
+        texels, count = self.settings.resolution**2, len(probes)
+        work = bake_kernels.ProbeWork()
+        work.probes = self._array(probes.astype(np.int32), wp.int32)
+        work.rays = rays
+        work.seed = (self.seed * 0x9E3779B1 + self.refreshes * 0x85EBCA77 + 1) & 0xFFFFFFFF
+        work.sky_probability = sky_probability(scene)
+        work.radius = 2.0 * float(np.linalg.norm(self.grid.spacing))
+        for name in ("direct", "albedo"):
+            setattr(work, name, wp.empty(count * texels, dtype=wp.uint32, device=self.device))
+        work.emission = wp.empty(count * texels * with_emission, dtype=wp.uint32, device=self.device)
+        work.back = wp.empty(count * texels, dtype=wp.uint8, device=self.device)
+        work.light_low = math.gcd(LIGHT_RESOLUTION, self.settings.resolution)
+        work.light_directions = self._array(low_directions(work.light_low), wp.vec4)
+        work.light = wp.empty(count * work.light_low**2, dtype=wp.vec3, device=self.device)
+        work.distance_low = math.gcd(DISTANCE_RESOLUTION, self.settings.resolution)
+        work.distance_directions = self._array(low_directions(work.distance_low), wp.vec4)
+        work.distances = wp.empty(count * work.distance_low**2, dtype=wp.vec2, device=self.device)
+        return work
+
+    def _trace(
+        self, data: Any, work: Any, probes: np.ndarray, told: Callable[[float], None] = lambda share: None
+    ) -> None:
+        texels = self.settings.resolution**2
+        step = max(1, BATCH_TEXELS // texels)
+        for start in range(0, len(probes), step):
+            part = _part(work, start, min(start + step, len(probes)), texels)
+            self._launch(bake_kernels.trace_texels, len(part.probes) * texels, [data, self.field, part])
+            told((start + len(part.probes)) / len(probes))
+        blocks = (self.settings.resolution // int(field_kernels.BLOCK)) ** 2
+        self._launch(bake_kernels.find_nearest, len(probes) * blocks, [self.field, work])
+        self._launch(bake_kernels.reduce_distances, len(probes) * work.distance_low**2, [self.field, work])
+        size = self.settings.irradiance_resolution**2
+        self._launch(bake_kernels.filter_distances, len(probes) * size, [self.field, work])
+
+    def _bounce(self, work: Any, count: int, is_last: bool = False) -> None:
+        """Let light bounce once, and set the radiance of all texels if it is for the last time."""
+        work.is_last = int(is_last)
+        shared = LAST_SHARING_RESOLUTION if is_last else SHARING_RESOLUTION
+        scale = self.settings.resolution // work.light_low
+        side = math.gcd(scale, max(self.settings.resolution // shared, 1))
+        self._launch(bake_kernels.bounce, count * work.light_low**2, [self.field, work, side])
+        size = self.settings.irradiance_resolution**2
+        self._launch(bake_kernels.filter_light, count * size, [self.field, work])
+
+    def _find_covered(self, work: Any) -> None:
+        """Leave out probes that mostly see back faces, unless all do: then it is the faces that are the wrong way."""
+        back = work.back.numpy().reshape(self.grid.probe_count, -1).mean(axis=1)
+        covered = back > COVERED_SHARE
+        if covered.all():
+            covered[:] = False
+        states = np.where(covered, int(field_kernels.PROBE_COVERED), int(field_kernels.PROBE_USABLE))
+        self.field.states = self._array(states.astype(np.int32), wp.int32)
+
+    def _keep_emission(self, work: Any) -> None:
+        """Keep the radiance of texels that see an emitter, by their index."""
+        if work.emission.shape[0] == 0:
+            return
+        emission = work.emission.numpy()
+        texels = np.flatnonzero(emission).astype(np.int32)
+        self.field.emission_texels = self._array(texels, wp.int32)
+        self.field.emission = self._array(emission[texels], wp.uint32)
+
+    # ---- bakes ----
+
+    def to_bake(self, scene: Any) -> Bake:
+        """Return all that was baked."""
+        field, settings = self.field, self.settings
+        names = ("positions", "states", "radiance", "surfels", "irradiance", "moments", "emission_texels", "emission")
+        arrays = {name: getattr(field, name).numpy().copy() for name in names}
+        arrays |= {
+            "grid_low": self.grid.low,
+            "grid_spacing": self.grid.spacing,
+            "grid_counts": np.array(self.grid.counts, np.int32),
+            "bounds": scene.bounds,
+        }
+        counts = {
+            "probes": self.grid.probe_count,
+            "covered": int((arrays["states"] != 0).sum()),
+            "rays": self.grid.probe_count * settings.resolution**2 * settings.rays,
+            **{f"change_{number + 1}": change for number, change in enumerate(self.changes)},
+        }
+        return Bake("LightFieldProbes", scene.contents_hash, settings.bake_settings(scene), arrays, counts, scene.name)
+
+    def _load(self, bake: Bake) -> None:
+        """Take over what a bake holds."""
+        field = self.field
+        dtypes = {"positions": wp.vec3, "irradiance": wp.vec3, "moments": wp.vec2, "states": wp.int32}
+        dtypes |= {"emission_texels": wp.int32, "radiance": wp.uint32, "surfels": wp.uint32, "emission": wp.uint32}
+        for name, dtype in dtypes.items():
+            setattr(field, name, self._array(bake.arrays[name], dtype))
+        passes = sum(name.startswith("change_") for name in bake.counts)
+        self.changes = [float(bake.counts[f"change_{number + 1}"]) for number in range(passes)]
+        work = bake_kernels.ProbeWork()
+        work.probes = self._array(np.arange(self.grid.probe_count, dtype=np.int32), wp.int32)
+        blocks = (self.settings.resolution // int(field_kernels.BLOCK)) ** 2
+        self._launch(bake_kernels.find_nearest, self.grid.probe_count * blocks, [field, work])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all maps on the device."""
+        field = self.field
+        arrays = (field.radiance, field.surfels, field.nearest, field.irradiance, field.moments, field.emission)
+        return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays)
+
+
+def lit_data(scene: Any, device: wp.Device) -> types.SceneData:
+    """Return the scene's buffers with emitters picked by power, whatever the pipeline's estimator of them does."""
+    data = launch.copied(scene.data(device), types.SceneData)
+    data.emitters = launch.copied(data.emitters, types.Emitters)
+    if scene.emitter_count:
+        data.emitters.alias = AliasTable.build(scene.emitter_powers()).on(device)
+    return data
+
+
+def _part(work: Any, start: int, stop: int, texels: int) -> Any:
+    """Return the work of slots ``start`` to ``stop`` - 1 alone, in the same memory."""
+    part = launch.copied(work, bake_kernels.ProbeWork)
+    part.probes = work.probes[start:stop]
+    for name in ("direct", "albedo", "back", "emission"):
+        array = getattr(work, name)
+        if array.shape[0]:
+            setattr(part, name, array[start * texels : stop * texels])
+    return part
