@@ -97,19 +97,25 @@ def project(camera: CameraData, direction: wp.vec3) -> wp.vec2:
     return wp.vec2(0.5 * (x + 1.0) * wp.float32(camera.width), 0.5 * (1.0 - y) * wp.float32(camera.height))
 
 
-# Thread: a pixel. Traces one camera ray; jitters it unless there is only one camera sample.
-@wp.kernel
-def trace_primary(first: wp.int32, scene: SceneData, camera: CameraData, settings: PassSettings, hits: PrimaryHits):
-    p = tiled_pixel(first + wp.tid(), camera.width)
-    if p[0] >= camera.width or p[1] >= camera.height:
-        return
+# Direction of the camera ray of a pixel; jittered unless there is only one camera sample.
+@wp.func
+def primary_direction(camera: CameraData, settings: PassSettings, p: wp.vec2i) -> wp.vec3:
     offset = wp.vec2(0.0, 0.0)
     if settings.camera_samples > 1:
         index = pixel_sample_index(p[0], p[1], settings.camera_sample, settings.camera_bits)
         seed = pixel_seed(p[0], p[1], settings.camera_bits, settings.seed)
         u = sample_2d(index, seed, 0)
         offset = wp.vec2(filter_offset(settings.tent, u[0]), filter_offset(settings.tent, u[1]))
-    direction = camera_ray(camera, wp.float32(p[0]) + 0.5 + offset[0], wp.float32(p[1]) + 0.5 + offset[1])
+    return camera_ray(camera, wp.float32(p[0]) + 0.5 + offset[0], wp.float32(p[1]) + 0.5 + offset[1])
+
+
+# Thread: a pixel. Traces one camera ray.
+@wp.kernel
+def trace_primary(first: wp.int32, scene: SceneData, camera: CameraData, settings: PassSettings, hits: PrimaryHits):
+    p = tiled_pixel(first + wp.tid(), camera.width)
+    if p[0] >= camera.width or p[1] >= camera.height:
+        return
+    direction = primary_direction(camera, settings, p)
     hit = bvh_intersect(scene.bvh, camera.position, direction, float(wp.inf))
     pixel = p[1] * camera.width + p[0]
     hits.direction[pixel] = direction

@@ -5,12 +5,20 @@ What probes hold is reflected light; what a ray sees of the sky and of emitters 
 
 import warp as wp
 
-from warp_gi.kernels.bsdf import Bsdf, average_fresnel, average_reflectance, bsdf_sample, specular_sample
-from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, tiled_pixel
-from warp_gi.kernels.light_field import LightField, irradiance_at, unpack_radiance
+from warp_gi.kernels.bsdf import BsdfSample, average_fresnel, bsdf_sample, fresnel, specular_sample
+from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, primary_direction, tiled_pixel
+from warp_gi.kernels.light_field import (
+    NOTHING,
+    LightField,
+    irradiance_at,
+    surfel_distance,
+    surfel_normal,
+    texel_emission,
+    unpack_radiance,
+)
 from warp_gi.kernels.light_field_march import MISS, march
 from warp_gi.kernels.sampling import pixel_sample_index, pixel_seed, sample_1d, sample_2d
-from warp_gi.kernels.surface import ray_origin, surface_at
+from warp_gi.kernels.surface import Surface, ray_origin, surface_at
 from warp_gi.kernels.types import SceneData
 
 wp.set_module_options({"enable_backward": False})
@@ -27,13 +35,28 @@ DIRECTION_DIMENSION = wp.constant(41)
 class ProbeQuery:
     mode: wp.int32  # MODE_*
     rays: wp.int32  # of the current camera sample
-    share: wp.float32  # samples that a ray stands for
 
 
 # Sums over samples, [height * width].
 @wp.struct
 class ProbeBuffers:
     indirect: wp.array(dtype=wp.vec3)
+    moment1: wp.array(dtype=wp.vec3)
+    moment2: wp.array(dtype=wp.vec3)
+    diffuse: wp.array(dtype=wp.vec3)  # light as the diffuse lobe receives it, for a denoiser; or empty
+    glossy: wp.array(dtype=wp.vec3)  # what the glossy lobe reflects
+
+
+# Sums over camera samples, [height * width], of a picture that is all seen through probes.
+@wp.struct
+class ProbeView:
+    emission: wp.array(dtype=wp.vec3)
+    indirect: wp.array(dtype=wp.vec3)
+    normal: wp.array(dtype=wp.vec3)
+    position: wp.array(dtype=wp.vec3)  # this and the following: of the first camera sample
+    depth: wp.array(dtype=wp.float32)
+    object_id: wp.array(dtype=wp.int32)
+    material_id: wp.array(dtype=wp.int32)
     moment1: wp.array(dtype=wp.vec3)
     moment2: wp.array(dtype=wp.vec3)
 
@@ -47,14 +70,55 @@ def reflected_radiance(field: LightField, origin: wp.vec3, direction: wp.vec3) -
     return unpack_radiance(field.radiance[hit.probe * field.resolution * field.resolution + hit.texel])
 
 
-# Share of light from everywhere that leaves as if from Lambert.
+# Light of a sample, apart for a denoiser.
+@wp.struct
+class Lobes:
+    diffuse: wp.vec3  # as it comes in
+    glossy: wp.vec3  # as it goes out
+
+
+# Light that the filtered irradiance of the probes gives a surface: to its diffuse lobe, and in the mode without rays
+# to the glossy one as if that were Lambert too.
 @wp.func
-def diffuse_reflectance(b: Bsdf, mode: wp.int32) -> wp.vec3:
+def steady_light(field: LightField, s: Surface, mode: wp.int32) -> Lobes:
+    r = Lobes()
+    if mode == MODE_TRACED or (mode == MODE_HYBRID and wp.max(s.bsdf.diffuse) <= 0.0):
+        return r
+    normal = wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
+    arriving = irradiance_at(field, s.position, normal) / wp.pi
+    f = average_fresnel(s.bsdf)
+    r.diffuse = wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - f, arriving)
     if mode == MODE_IRRADIANCE:
-        return average_reflectance(b)
+        r.glossy = wp.cw_mul(f, arriving)
+    return r
+
+
+# Light of a ray through the probes, by the glossy lobe alone or by the whole BSDF.
+@wp.func
+def ray_light(field: LightField, s: Surface, wo: wp.vec3, mode: wp.int32, index: wp.uint32, seed: wp.uint32) -> Lobes:
+    r = Lobes()
+    u = sample_2d(index, seed, DIRECTION_DIMENSION)
+    sample = BsdfSample()
+    if mode == MODE_HYBRID:
+        sample = specular_sample(s.bsdf, wo, u)
+    else:
+        u_lobe = float(0.0)
+        if s.bsdf.f90 > 0.0:
+            u_lobe = sample_1d(index, seed, LOBE_DIMENSION)
+        sample = bsdf_sample(s.bsdf, wo, u_lobe, u)
+    wi = s.shading * sample.wi
+    if sample.pdf <= 0.0 or wp.dot(wi, s.normal) <= 0.0:
+        return r
+    light = reflected_radiance(field, ray_origin(s), wi)
+    r.glossy = wp.cw_mul(sample.weight, light)
     if mode == MODE_TRACED:
-        return wp.vec3(0.0, 0.0, 0.0)
-    return wp.cw_mul(b.diffuse, wp.vec3(1.0, 1.0, 1.0) - average_fresnel(b))
+        f = wp.vec3(0.0, 0.0, 0.0)
+        if s.bsdf.f90 > 0.0:
+            f = fresnel(s.bsdf, wp.dot(wo, wp.normalize(wo + sample.wi)))
+        share = sample.wi[2] / (wp.pi * sample.pdf)
+        r.diffuse = wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - f, light) * share
+        r.glossy = r.glossy - wp.cw_mul(s.bsdf.diffuse, r.diffuse)
+    return r
 
 
 # Thread: a pixel.
@@ -76,42 +140,71 @@ def trace_probes(
     face = hits.face[pixel]
     if face < 0:
         return
-    direction = hits.direction[pixel]
-    s = surface_at(scene, face, hits.u[pixel], hits.v[pixel], -direction)
-    wo = wp.transpose(s.shading) * -direction
-    count = wp.float32(settings.sample_count)
-    steady = wp.vec3(0.0, 0.0, 0.0)  # light without noise
-    diffuse = diffuse_reflectance(s.bsdf, query.mode)
-    if wp.max(diffuse) > 0.0:
-        normal = wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
-        steady = wp.cw_mul(diffuse, irradiance_at(field, s.position, normal)) / wp.pi
-    total = steady * count
-    moment1 = steady * count
-    moment2 = wp.cw_mul(steady, steady) * count
+    s = surface_at(scene, face, hits.u[pixel], hits.v[pixel], -hits.direction[pixel])
+    wo = wp.transpose(s.shading) * -hits.direction[pixel]
+    steady = steady_light(field, s, query.mode)
+    rays = int(0)
     if query.mode == MODE_TRACED or (query.mode == MODE_HYBRID and s.bsdf.f90 > 0.0):
-        seed = pixel_seed(p[0], p[1], settings.sample_bits, settings.seed)
-        first_index = pixel_sample_index(p[0], p[1], settings.first_sample, settings.sample_bits)
-        origin = ray_origin(s)
-        total = wp.vec3(0.0, 0.0, 0.0)
-        moment2 = wp.vec3(0.0, 0.0, 0.0)
-        for i in range(query.rays):
-            index = first_index + wp.uint32(i)
-            u = sample_2d(index, seed, DIRECTION_DIMENSION)
-            sample = specular_sample(s.bsdf, wo, u)
-            if query.mode == MODE_TRACED:
-                u_lobe = float(0.0)
-                if s.bsdf.f90 > 0.0:
-                    u_lobe = sample_1d(index, seed, LOBE_DIMENSION)
-                sample = bsdf_sample(s.bsdf, wo, u_lobe, u)
-            light = steady
-            wi = s.shading * sample.wi
-            if sample.pdf > 0.0 and wp.dot(wi, s.normal) > 0.0:
-                light = light + wp.cw_mul(sample.weight, reflected_radiance(field, origin, wi))
-            total = total + light
-            moment2 = moment2 + wp.cw_mul(light, light)
-        total = total * query.share
-        moment1 = total
-        moment2 = moment2 * query.share
+        rays = query.rays
+    share = wp.float32(settings.sample_count)  # samples that one evaluation stands for
+    if rays > 0:
+        share = share / wp.float32(rays)
+    seed = pixel_seed(p[0], p[1], settings.sample_bits, settings.seed)
+    first_index = pixel_sample_index(p[0], p[1], settings.first_sample, settings.sample_bits)
+    diffuse = wp.vec3(0.0, 0.0, 0.0)
+    glossy = wp.vec3(0.0, 0.0, 0.0)
+    moment2 = wp.vec3(0.0, 0.0, 0.0)
+    for i in range(wp.max(rays, 1)):
+        light = steady
+        if rays > 0:
+            by_ray = ray_light(field, s, wo, query.mode, first_index + wp.uint32(i), seed)
+            light.diffuse = light.diffuse + by_ray.diffuse
+            light.glossy = light.glossy + by_ray.glossy
+        leaving = wp.cw_mul(s.bsdf.diffuse, light.diffuse) + light.glossy
+        diffuse = diffuse + light.diffuse
+        glossy = glossy + light.glossy
+        moment2 = moment2 + wp.cw_mul(leaving, leaving)
+    total = (wp.cw_mul(s.bsdf.diffuse, diffuse) + glossy) * share
     buffers.indirect[pixel] = buffers.indirect[pixel] + total
-    buffers.moment1[pixel] = buffers.moment1[pixel] + moment1
-    buffers.moment2[pixel] = buffers.moment2[pixel] + moment2
+    buffers.moment1[pixel] = buffers.moment1[pixel] + total
+    buffers.moment2[pixel] = buffers.moment2[pixel] + moment2 * share
+    if buffers.diffuse.shape[0] > 0:
+        buffers.diffuse[pixel] = buffers.diffuse[pixel] + diffuse * share
+        buffers.glossy[pixel] = buffers.glossy[pixel] + glossy * share
+
+
+# Thread: a pixel. What the camera sees of the probes' surfels and of the sky behind them.
+@wp.kernel
+def view_probes(first: wp.int32, camera: CameraData, settings: PassSettings, field: LightField, view: ProbeView):
+    p = tiled_pixel(first + wp.tid(), camera.width)
+    if p[0] >= camera.width or p[1] >= camera.height:
+        return
+    pixel = p[1] * camera.width + p[0]
+    direction = primary_direction(camera, settings, p)
+    hit = march(field, camera.position, direction, 0.0, float(wp.inf), MOST_STEPS)
+    position = wp.vec3(0.0, 0.0, 0.0)
+    depth = float(wp.inf)
+    reflected = wp.vec3(0.0, 0.0, 0.0)
+    emitted = wp.vec3(0.0, 0.0, 0.0)
+    if hit.probe >= 0:
+        texel = hit.probe * field.resolution * field.resolution + hit.texel
+        surfel = field.surfels[texel]
+        if hit.result != MISS:
+            reflected = unpack_radiance(field.radiance[texel])
+            emitted = texel_emission(field, texel)
+            position = camera.position + direction * hit.t
+            depth = wp.dot(position - camera.position, camera.forward)
+            view.normal[pixel] = view.normal[pixel] + surfel_normal(surfel)
+        elif surfel_distance(surfel) >= NOTHING:
+            emitted = unpack_radiance(field.radiance[texel])
+    count = wp.float32(settings.sample_count)
+    radiance = reflected + emitted
+    view.emission[pixel] = view.emission[pixel] + emitted
+    view.indirect[pixel] = view.indirect[pixel] + reflected * count
+    view.moment1[pixel] = view.moment1[pixel] + radiance * count
+    view.moment2[pixel] = view.moment2[pixel] + wp.cw_mul(radiance, radiance) * count
+    if settings.camera_sample == 0:
+        view.position[pixel] = position
+        view.depth[pixel] = depth
+        view.object_id[pixel] = -1
+        view.material_id[pixel] = -1

@@ -9,6 +9,7 @@ import warp as wp
 import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench.presets import light, quad, sphere
+from warp_gi.kernels import denoise as denoise_kernels
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_bake as bake_kernels
 from warp_gi.techniques.light_field_state import ProbeState, lit_data, low_directions, probe_grid
@@ -392,3 +393,61 @@ def test_preset_and_defaults():
     assert isinstance(pipeline.indirect, gi.LightFieldProbes)
     assert replace(pipeline.indirect, mode="traced").mode == "traced"
     assert pipeline.describe()["indirect.resolution"] == 256
+
+
+# ---- without geometry ----
+
+
+def test_a_bake_alone_shows_the_room(tmp_path):
+    """Camera rays traced through the probes show emission, reflected light and depth, with no scene in memory."""
+    block = sphere((0.4, -0.6, -0.4), 0.35, gi.Material("block", (0.3, 0.6, 0.3), specular=0.0))
+    scene = lamp_room(block)
+    camera = gi.Camera.look_at((0.1, -0.3, 0.8), (0, 0.2, -0.5), hfov=85, resolution=(48, 32))
+    settings = {**SMALL, "resolution": 128, "rays": 8, "counts": (3, 3, 3)}
+    path = gi.bake(scene, gi.LightFieldProbes(**settings)).save(tmp_path / "room.safetensors")
+    frame = next(gi.render(gi.load_bake(path), camera, gi.Pipeline.preset("probe_view", spp=1)))
+    truth = next(gi.render(scene, camera, gi.Pipeline.preset("path", spp=256, camera_samples=1), seed=3))
+    seen, expected = frame.numpy("depth"), truth.numpy("depth")
+    assert (np.abs(seen / expected - 1) < 0.02).mean() > 0.95
+    np.testing.assert_allclose(frame.numpy("beauty"), frame.numpy("emission") + frame.numpy("indirect"), rtol=1e-6)
+    assert abs(frame.numpy("beauty").mean() / truth.numpy("beauty").mean() - 1) < 0.09
+    assert gi.metrics.rmse(frame.numpy("indirect"), truth.numpy("emitters") + truth.numpy("indirect")) < 0.1
+    assert frame.numpy("emission").max() == pytest.approx(8.0, rel=0.01)  # the lamp
+    assert (frame.numpy("object_id") == -1).all()
+
+
+def test_a_bake_alone_shows_the_sky():
+    floor = walls(gi.Material("floor", (0.5,) * 3, specular=0.0))[0]
+    ball = sphere((0, -0.4, 0), 0.3, gi.Material("ball", (0.8,) * 3, specular=0.0))
+    scene = gi.Scene([gi.Node("all", [floor, ball])], environment=(0.25, 0.5, 1.0))
+    camera = gi.Camera.look_at((0.6, -0.7, 0.8), (0, -0.4, 0), hfov=70, resolution=(24, 16))
+    bake = gi.bake(scene, gi.LightFieldProbes(**{**SMALL, "resolution": 64}))
+    image = next(gi.render(bake, camera, gi.Pipeline.preset("probe_view", spp=1))).numpy("beauty")
+    np.testing.assert_allclose(image[0, 0], [0.25, 0.5, 1.0], rtol=0.01)
+
+
+def test_only_probes_can_be_rendered_alone():
+    bake = gi.bake(lamp_room(), gi.LightFieldProbes(**SMALL))
+    with pytest.raises(gi.OptionError, match="probe_view"):
+        next(gi.render(bake, view(), gi.Pipeline.preset("probes")))
+    with pytest.raises(gi.OptionError, match="leave the other terms"):
+        gi.Pipeline(indirect=gi.LightFieldProbes(primary="probes"))
+    field = gi.bake(lamp_room(environment=1.0), gi.VisibilityField(samples=1000, resolution=8))
+    with pytest.raises(gi.BakeError, match="cannot be rendered without its scene"):
+        next(gi.render(field, view(), gi.Pipeline.preset("probe_view")))
+
+
+# ---- denoising ----
+
+
+@pytest.mark.parametrize("mode", ["irradiance", "hybrid", "traced"])
+def test_lobes_are_parts_of_the_term(mode):
+    """What is handed to a denoiser adds up to the term, and filtering lowers the error of traced rays."""
+    coat = gi.Material("coat", (0.5, 0.3, 0.2), roughness=0.4)
+    scene = lamp_room(quad((-0.8, -0.8, -0.95), (1.6, 0, 0), (0, 1.6, 0), coat))
+    pipeline = replace(indirect_only(4, **SMALL, mode=mode), denoise="spatiotemporal")
+    frame = next(gi.render(scene, view(), replace(pipeline, camera_samples=1), seed=1))
+    diffuse, glossy = (array.numpy().reshape(16, 24, 3) for array in frame.lobes())
+    albedo = frame.struct(denoise_kernels.Guides).guide_diffuse.numpy().reshape(16, 24, 3)
+    np.testing.assert_allclose(albedo * diffuse + glossy, frame.numpy("indirect"), rtol=1e-4, atol=1e-6)
+    assert glossy.any() and diffuse.any()

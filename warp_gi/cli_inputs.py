@@ -114,6 +114,10 @@ def find_camera(options: SceneOptions, scene: Scene, report: Reporter) -> Camera
         raise unknown_name("camera", options.camera, [*scene.cameras, *BUILTIN_SCENES, "a .json file"])
     elif (options.scene or DEFAULT_SCENE) in BUILTIN_SCENES:
         camera = builtin_camera_path(options.scene or DEFAULT_SCENE)
+    elif scene.name in BUILTIN_SCENES and not scene.triangle_count:  # a bake of it
+        camera = builtin_camera_path(scene.name)
+    elif not scene.triangle_count:
+        raise OptionError("a bake has no camera; give --camera or --eye and --target, inside of the scene")
     elif scene.cameras:
         camera = scene_camera(scene, next(iter(scene.cameras)))
     else:

@@ -24,6 +24,7 @@ from warp_gi.cli_report import Reporter, start_warp
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.files import check_writable, remove_stale_parts
 from warp_gi.pipeline import TERMS, Estimator, Pipeline
+from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.environment import Environment
 from warp_gi.scene.scene import Scene
 from warp_gi.scheduler import FrameScheduler
@@ -46,7 +47,11 @@ all: stop with Ctrl-C or kill the process at any time, and carry on with --resum
   warp-gi render hall.glb --environment city.exr --camera path.json --frames 0-47 --spp 64
   warp-gi render hall.glb --eye 4 1.7 2 --target -3 1.6 -0.5 -o out/still.exr --preview
   warp-gi render hall.glb --pipeline dvf --bake out/hall.dvf.safetensors --environment-turn 2
+  warp-gi render hall.glb --pipeline probes --denoise spatiotemporal
+  warp-gi render out/hall.probes.safetensors --camera path.json
   warp-gi render cornell_box --pipeline path,emitters=UniformLights --indirect.max-depth 4"""
+
+BAKE_SUFFIX = ".safetensors"
 
 
 @dataclass
@@ -54,8 +59,8 @@ class Render(SceneOptions):
     """What to render, and how."""
 
     scene: Annotated[str, tyro.conf.Positional, flag("[SCENE]", f"{DEFAULT_SCENE}, with previews")] = ""
-    """A GLB, glTF, OBJ or PLY file, or the name of a built-in scene."""
-    pipeline: Annotated[str, flag("NAME", "path")] = "path"
+    """A GLB, glTF, OBJ or PLY file, the name of a built-in scene, or a bake of probes, .safetensors, to show alone."""
+    pipeline: Annotated[str, flag("NAME", "path; probe_view for a bake alone")] = ""
     """Preset, with estimators exchanged after commas: path,indirect=none. Its settings are the flags below."""
     denoise: Annotated[str, flag("NAME", "as the pipeline says: none")] = ""
     """none, oidn or spatiotemporal, whose settings are then flags below."""
@@ -116,11 +121,17 @@ def main(arguments: Sequence[str]) -> int:
 
 def parse(arguments: Sequence[str]) -> Render:
     """Return the options; the pipeline named among them decides which settings there are."""
-    chosen = {"--pipeline": "path", "--denoise": ""}
+    chosen = {"--pipeline": "", "--denoise": ""}
+    before = ""
+    is_bake = False
     for index, argument in enumerate(arguments):
         name, equals, value = argument.partition("=")
         if name in chosen and (equals or index + 1 < len(arguments)):
             chosen[name] = value if equals else arguments[index + 1]
+        is_bake = is_bake or (argument.endswith(BAKE_SUFFIX) and not before.startswith("-"))
+        before = argument
+    if not chosen["--pipeline"]:
+        chosen["--pipeline"] = "probe_view" if is_bake else "path"
     settings = pipeline_named(chosen["--pipeline"])
     if chosen["--denoise"]:
         settings = replace(settings, denoise=_denoiser(chosen["--denoise"]))
@@ -177,11 +188,16 @@ def run(options: Render, report: Reporter) -> None:
     resolution = parse_resolution(options.resolution) if options.resolution else None
     bakes = [load_bake(path) for path in options.bake]
     with report.phase("scene"):
-        scene = find_scene(options)
+        scene = BakedScene(load_bake(options.scene)) if options.scene.endswith(BAKE_SUFFIX) else find_scene(options)
         camera = find_camera(options, scene, report)
     if resolution:
         camera = camera.at_resolution(*resolution)
-    report.line(f"{scene.name}: {scene.triangle_count:,} triangles, {scene.emitter_count:,} emitters")
+    if isinstance(scene, BakedScene):
+        report.line(f"{scene.name}: a bake, without its scene")
+        if options.environment:
+            raise OptionError("--environment goes with a scene; a bake shows the sky that it was baked under")
+    else:
+        report.line(f"{scene.name}: {scene.triangle_count:,} triangles, {scene.emitter_count:,} emitters")
     shots = plan(options, camera)
     sky = scene.environment
     if not math.isfinite(options.environment_turn):
@@ -189,7 +205,8 @@ def run(options: Render, report: Reporter) -> None:
     if options.environment_turn and sky is None:
         raise OptionError(f"--environment-turn needs a sky to turn, and {scene.name} has none; give --environment too")
     turn_sky(options, scene, sky, shots[0].index)
-    scheduler = FrameScheduler(scene, camera, options.settings, options.device, options.seed, report.stage, bakes)
+    source = scene.bake if isinstance(scene, BakedScene) else scene
+    scheduler = FrameScheduler(source, camera, options.settings, options.device, options.seed, report.stage, bakes)
     with report.phase("bake"):
         scheduler.bake()
     todo = []

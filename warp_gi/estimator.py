@@ -26,6 +26,11 @@ class Estimator:
     term: ClassVar[str]
     """"environment", "emitters" or "indirect"."""
 
+    @property
+    def makes_primary(self) -> bool:
+        """Whether the estimator finds out what the camera sees, too: then it is the only one of its pipeline."""
+        return False
+
     def __post_init__(self) -> None:
         self.validate()
 
@@ -64,6 +69,10 @@ class Estimator:
     def preprocess(self, frame: Frame, state: Any) -> Any:
         """Return the state for this frame, from the scene's changes and the previous state."""
         return state
+
+    def trace_primary(self, frame: Frame, state: Any) -> None:
+        """Fill all buffers for the current camera sample; asked of an estimator that ``makes_primary``."""
+        raise NotImplementedError
 
     def trace(self, frame: Frame, state: Any) -> None:
         """Add this term's samples of the current camera sample to the frame's buffers."""

@@ -64,6 +64,12 @@ class Pipeline:
         for term, estimator in zip(TERMS, (self.environment, self.emitters, self.indirect), strict=True):
             if estimator is not None and getattr(estimator, "term", None) != term:
                 raise OptionError(f"{term} must be an estimator of that term or None, got {estimator!r}")
+        alone = [estimator for _, estimator in self.estimators() if estimator.makes_primary]
+        if alone and (len(list(self.estimators())) > 1 or self.denoise is not None):
+            raise OptionError(
+                f"{type(alone[0]).__name__} finds primary hits itself, and holds all light that they send; leave the "
+                'other terms and the denoiser out, as the preset "probe_view" does'
+            )
 
     @property
     def camera_sample_count(self) -> int:
@@ -110,5 +116,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     "direct": {"indirect": None},
     "dvf": {"environment": VisibilityField()},
     "probes": {"indirect": LightFieldProbes()},
+    "probe_view": {"environment": None, "emitters": None, "indirect": LightFieldProbes(primary="probes")},
 }
 """Fields of each named pipeline, where they differ from the defaults."""

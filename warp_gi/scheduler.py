@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from numbers import Integral
 from typing import Any
 
@@ -20,6 +21,7 @@ from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.kernels import compose, denoise, gbuffer, path_trace, types
 from warp_gi.pipeline import TERMS, Pipeline
+from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.scene import Scene
 from warp_gi.techniques.baselines import BsdfPaths, PowerLights, sky_probability
 
@@ -178,7 +180,7 @@ class FrameScheduler:
     """Renders frames of a scene along a camera path: bake once, then preprocess and trace each frame.
 
     Args:
-        scene: What is rendered.
+        scene: What is rendered; or a Bake that can be rendered without its scene, by the preset "probe_view".
         camera: A Camera, or a CameraPath whose frames are at ``index / fps`` seconds.
         pipeline: The estimators.
         device: "cpu", "cuda", "cuda:1".
@@ -191,7 +193,7 @@ class FrameScheduler:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Scene | Bake,
         camera: Camera | CameraPath,
         pipeline: Pipeline,
         device: str = "cpu",
@@ -199,15 +201,18 @@ class FrameScheduler:
         progress: Callable[[str, float], None] | None = None,
         bakes: Iterable[Bake] = (),
     ) -> None:
+        if isinstance(scene, Bake):
+            scene, pipeline, bakes = BakedScene(scene), _fitting(pipeline, scene), [*bakes, scene]
         for what, value, kinds in (
-            ("scene", scene, Scene),
+            ("scene", scene, (Scene, BakedScene)),
             ("camera", camera, (Camera, CameraPath)),
             ("pipeline", pipeline, Pipeline),
             ("seed", seed, Integral),
         ):
             if not isinstance(value, kinds):
                 names = " or ".join(kind.__name__ for kind in (kinds if isinstance(kinds, tuple) else (kinds,)))
-                raise OptionError(f"{what} must be a {names.replace('Integral', 'whole number')}, got {value!r:.80}")
+                names = names.replace("Integral", "whole number").replace("BakedScene", "Bake")
+                raise OptionError(f"{what} must be a {names}, got {value!r:.80}")
         if seed < 0:
             raise OptionError(f"seed must be 0 or above, got {seed}")
         self.scene, self.pipeline, self.seed = scene, pipeline, seed
@@ -255,7 +260,7 @@ class FrameScheduler:
             self._progress(f"bake {term}", 0.0)
             told = lambda share: self._progress(f"bake {term}", share)  # noqa: E731
             bake = estimator.bake(self.scene, device, self.seed, told, self.camera)
-        else:
+        elif not isinstance(self.scene, BakedScene):
             settings = estimator.bake_settings(self.scene)
             bake.check(type(estimator).__name__, estimator.bake_key(self.scene), settings, self.scene.name)
         return estimator.start(self.scene, device, bake, self.seed)
@@ -344,6 +349,11 @@ class FrameScheduler:
         settings.sample_count = pipeline.spp * (view + 1) // views - settings.first_sample
         settings.sample_bits = (pipeline.spp - 1).bit_length()
         settings.tent = int(pipeline.filter == "tent")
+        for term, estimator in self._estimators.items():
+            if estimator.makes_primary:
+                with frame.stage("primary"):
+                    estimator.trace_primary(frame, self._states[term])
+                return
         with frame.stage("primary"):
             frame.launch_tiled(gbuffer.trace_primary, [frame.data, frame.camera_data, settings, frame.hits])
             cameras = [frame.camera_data, frame._previous_camera_data]
@@ -367,7 +377,7 @@ class FrameScheduler:
 
 
 def render(
-    scene: Scene,
+    scene: Scene | Bake,
     camera: Camera | CameraPath,
     pipeline: Pipeline | None = None,
     frames: Iterable[int] | None = None,
@@ -380,7 +390,7 @@ def render(
     """Yield the frames of a sequence.
 
     Args:
-        scene: What is rendered.
+        scene: What is rendered; or a Bake that can be rendered without its scene, by the preset "probe_view".
         camera: A Camera (one frame) or a CameraPath.
         pipeline: The estimators; None is the preset "path".
         frames: Frame numbers in order; None is every frame of the path.
@@ -431,6 +441,14 @@ def bake(
             f"{type(estimator).__name__} with these settings has nothing to bake; render with it as it is"
         )
     return result
+
+
+def _fitting(pipeline: Pipeline, bake: Bake) -> Pipeline:
+    """Return the pipeline with its settings as those of a bake that is rendered without its scene."""
+    indirect = pipeline.indirect
+    if indirect is None or not indirect.makes_primary:
+        raise OptionError('a bake without its scene is rendered by the preset "probe_view"; give the scene for others')
+    return replace(pipeline, indirect=indirect.fitting(bake))
 
 
 def _bakes_by_term(bakes: Iterable[Bake], estimators: dict[str, Estimator]) -> dict[str, Bake]:

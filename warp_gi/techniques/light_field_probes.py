@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from warp_gi import launch
 from warp_gi.baking import Bake
 from warp_gi.camera import Camera, CameraPath
-from warp_gi.errors import OptionError, unknown_name
+from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_trace as trace_kernels
@@ -69,7 +69,8 @@ class LightFieldProbes(Estimator):
     hysteresis: float = 0.5
     """Share of its old irradiance that a refreshed probe keeps."""
     primary: Literal["geometry", "probes"] = "geometry"
-    """"probes" traces the camera's rays through the probes too: no geometry is needed, a bake is enough."""
+    """"probes" traces the camera's rays through the probes too, which hold all light, not only indirect: no geometry
+    is needed, a bake is enough. Needs a pipeline without other terms, as the preset "probe_view"."""
 
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
@@ -139,7 +140,23 @@ class LightFieldProbes(Estimator):
         state.key = _key(scene, 0.0)
         return state
 
+    def fitting(self, bake: Bake) -> LightFieldProbes:
+        """Return these settings with those that a bake depends on replaced by its own.
+
+        Raises BakeError for a bake of another technique.
+        """
+        if bake.technique != "LightFieldProbes":
+            raise BakeError(f"expected a bake of LightFieldProbes, got one of {bake.technique}")
+        settings = {name: value for name, value in bake.settings.items() if name != "sky"}
+        counts = tuple(int(count) for count in settings["counts"].split("x"))
+        return replace(self, **{**settings, "counts": counts})
+
     # ---- frames ----
+
+    @property
+    def makes_primary(self) -> bool:
+        """Whether camera rays are traced through the probes."""
+        return self.primary == "probes"
 
     def preprocess(self, frame: Any, state: ProbeState) -> ProbeState:
         """Refresh some probes, if the sky or a pose is not what they saw."""
@@ -163,13 +180,20 @@ class LightFieldProbes(Estimator):
         settings = frame.pass_settings
         query = trace_kernels.ProbeQuery()
         query.mode = _MODES[self.mode]
-        rays = -(-self.pixel_rays // settings.camera_samples) or settings.sample_count
-        query.rays, query.share = rays, settings.sample_count / rays
+        query.rays = -(-self.pixel_rays // settings.camera_samples) or settings.sample_count
         buffers = trace_kernels.ProbeBuffers()
         buffers.indirect = frame["indirect"]
         buffers.moment1, buffers.moment2 = frame.moments("indirect")
+        if (lobes := frame.lobes()) is not None:
+            buffers.diffuse, buffers.glossy = lobes
         inputs = [frame.data, frame.camera_data, settings, state.field, query, frame.hits, buffers]
         frame.launch_tiled(trace_kernels.trace_probes, inputs)
+
+    def trace_primary(self, frame: Any, state: ProbeState) -> None:
+        """Fill the buffers by what camera rays meet in the probes (light_field_probes.txt, Fig. 20)."""
+        buffers = frame.struct(trace_kernels.ProbeView)
+        inputs = [frame.camera_data, frame.pass_settings, state.field, buffers]
+        frame.launch_tiled(trace_kernels.view_probes, inputs)
 
 
 def _check_whole(name: str, value: object, least: int, most: int) -> None:
