@@ -11,7 +11,8 @@ import argparse
 from typing import Any
 
 from warp_gi.bench import dvf_peers, runner
-from warp_gi.bench.dvf_views import PLACES, Place, Row, Stage, View, glossy, quality, race, rmse
+from warp_gi.bench.dvf_views import PLACES, FieldStage, View, glossy, quality
+from warp_gi.bench.stages import Place, Row, race, rmse
 
 SPP = 64
 CARD = "RTX 3080"
@@ -62,7 +63,7 @@ def _faster(times: dict[str, tuple[float, float]], name: str) -> Row:
 
 def mode_rows(name: str, view: View, repetitions: int, target: float) -> list[Row]:
     """Return a row for each mode at 64 samples a pixel, and one for all as in the paper."""
-    stages: dict[str, Stage] = {"traced": view.stage(SPP, mode="traced")}
+    stages: dict[str, FieldStage] = {"traced": view.stage(SPP, mode="traced")}
     stages |= {mode: view.stage(SPP, **settings) for mode, settings in MODES.items()}
     stages["paper, its settings"] = view.stage(SPP, **PAPER)
     times = race(stages, repetitions)

@@ -18,8 +18,9 @@ import numpy as np
 import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench import path, presets, rays
-from warp_gi.bench.dvf_views import PLACES, WHITE, Place, Row, timed_bake
+from warp_gi.bench.dvf_views import PLACES, WHITE
 from warp_gi.bench.mitsuba_peer import PeerMissing, load_mitsuba, to_mitsuba
+from warp_gi.bench.stages import Place, Row, timed_bake
 from warp_gi.bvh import TriangleBvh
 from warp_gi.scene import harmonics
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,34 +11,12 @@ import warp as wp
 import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench import presets
+from warp_gi.bench.stages import Place, Row, Stage, Times, rmse, timed_bake
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_audit as audit_kernels
 from warp_gi.techniques.visibility_state import FieldState
 
-Row = dict[str, Any]
-Times = tuple[float, float]
-"""Wall and CPU seconds."""
 WHITE = (1.0, 1.0, 1.0)
-
-
-@dataclass(frozen=True)
-class Place:
-    """A scene, diffuse under a white sky, and where it is seen from."""
-
-    name: str
-    scene: Callable[[], gi.Scene]
-    camera: Callable[[], gi.Camera]
-    target: float
-    """How many times faster the stage shall be with the field, at 64 samples a pixel."""
-    file: str = ""
-    settings: dict[str, Any] = field(default_factory=dict)
-    """Of its VisibilityField, where not the defaults."""
-
-    @property
-    def missing(self) -> str:
-        """What to say if the scene's file is not there, or nothing."""
-        path = presets.SCENES / self.file
-        return "" if not self.file or path.exists() else f"no {path}; set WARP_GI_SCENES"
 
 
 def _builtin(name: str) -> gi.Scene:
@@ -91,28 +67,10 @@ def glossy(scene: gi.Scene) -> gi.Scene:
     return gi.Scene(nodes, scene.lights, scene.environment, scene.cameras, scene.name)
 
 
-class Stage:
-    """A frame whose sky light can be traced again and again: primary rays and bake are done.
+class FieldStage(Stage):
+    """A stage of a visibility field."""
 
-    Stages of one scene, camera and number of samples draw the same samples, so what differs between their pictures
-    is what their estimators make of them.
-    """
-
-    def __init__(
-        self, scene: gi.Scene, camera: gi.Camera, estimator: gi.VisibilityField, spp: int, device: str, bake: Any
-    ) -> None:
-        pipeline = gi.Pipeline(environment=estimator, emitters=None, indirect=None, spp=spp, camera_samples=1)
-        scheduler = gi.FrameScheduler(scene, camera, pipeline, device, bakes=[bake] if bake is not None else [])
-        self.estimator, self.spp = estimator, spp
-        self.frame = scheduler.frame(0)
-        self.state: FieldState = scheduler.state("environment")
-        self.picture = self.frame.numpy("environment").copy()
-        self.albedo = self.frame.numpy("albedo").copy()
-
-    def trace(self) -> None:
-        """Do the stage once more; its sums are no picture any more."""
-        self.estimator.trace(self.frame, self.state)
-        wp.synchronize_device(self.frame.device)
+    state: FieldState
 
     @property
     def memory(self) -> int:
@@ -146,13 +104,13 @@ class View:
             self.bakes[key], self.bake_seconds[key] = timed_bake(self.scene, estimator, self.device, self.camera)
         return self.bakes[key], self.bake_seconds[key]
 
-    def stage(self, spp: int, **settings: Any) -> Stage:
+    def stage(self, spp: int, **settings: Any) -> FieldStage:
         """Return the stage at ``spp`` samples a pixel."""
         estimator = self.estimator(**settings)
         bake = None if estimator.mode == "traced" else self.bake(estimator)[0]
-        return Stage(self.scene, self.camera, estimator, spp, self.device, bake)
+        return FieldStage(self.scene, self.camera, estimator, spp, self.device, bake)
 
-    def scene_memory(self, stage: Stage) -> int:
+    def scene_memory(self, stage: FieldStage) -> int:
         """Return the bytes of the field if every cell of the scene were baked."""
         size = stage.state.grid.cell_size
         if size not in self._cells:
@@ -161,29 +119,7 @@ class View:
         return self._cells[size] * 4 * stage.state.words + stage.state.slots.nbytes
 
 
-def timed_bake(scene: gi.Scene, estimator: Any, device: str, camera: Any) -> tuple[gi.Bake, Times]:
-    """Return what the camera, or path, makes the estimator bake, and seconds without compilation."""
-    compiled, wall, cpu = launch.compile_seconds, time.perf_counter(), time.process_time()
-    bake = gi.bake(scene, estimator, device, camera_path=camera)
-    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    compiled = launch.compile_seconds - compiled
-    return bake, (wall - compiled, max(cpu - compiled, 0.0))
-
-
-def race(stages: dict[str, Stage], repetitions: int) -> dict[str, Times]:
-    """Return the median seconds of each stage; they take turns."""
-    times: dict[str, list[Times]] = {name: [] for name in stages}
-    for repetition in range(repetitions + 1):
-        for name, stage in stages.items():
-            wall, cpu = time.perf_counter(), time.process_time()
-            stage.trace()
-            taken = time.perf_counter() - wall, time.process_time() - cpu
-            if repetition:  # the first warms the caches
-                times[name].append(taken)
-    return {name: tuple(np.median(values, axis=0).tolist()) for name, values in times.items()}
-
-
-def audit(stage: Stage) -> dict[str, np.ndarray]:
+def audit(stage: FieldStage) -> dict[str, np.ndarray]:
     """Return for each pixel how many of its cosine-weighted rays are in which state, and how many sure ones wrong."""
     frame, state, names = stage.frame, stage.state, audit_kernels.AuditBuffers.vars
     buffers, count = audit_kernels.AuditBuffers(), int(np.prod(frame.camera.resolution))
@@ -194,7 +130,7 @@ def audit(stage: Stage) -> dict[str, np.ndarray]:
     return {name: getattr(buffers, name).numpy() for name in names}
 
 
-def traced_share(stage: Stage, counts: dict[str, np.ndarray]) -> float:
+def traced_share(stage: FieldStage, counts: dict[str, np.ndarray]) -> float:
     """Return the share of rays that the stage's mode traces."""
     visible, occluded = counts["visible"], counts["occluded"]
     open_, total = counts["mixed"] + counts["unknown"], visible + occluded + counts["mixed"] + counts["unknown"]
@@ -209,19 +145,14 @@ def traced_share(stage: Stage, counts: dict[str, np.ndarray]) -> float:
     return float(open_.sum() / max(total.sum(), 1))
 
 
-def white_error(stage: Stage, traced: Stage) -> np.ndarray:
+def white_error(stage: FieldStage, traced: FieldStage) -> np.ndarray:
     """Return how the pictures of Lambert surfaces under a white sky would differ if all were white, [pixel]."""
     channel = np.argmax(stage.albedo, axis=-1)[..., None]
     albedo, difference = (np.take_along_axis(a, channel, -1) for a in (stage.albedo, stage.picture - traced.picture))
     return (difference / np.maximum(albedo, 1e-6)).reshape(-1)
 
 
-def rmse(a: np.ndarray, b: np.ndarray | float = 0.0) -> float:
-    """Return the root of the mean squared difference."""
-    return float(np.sqrt(np.mean(np.square(np.asarray(a, np.float64) - b))))
-
-
-def quality(stage: Stage, traced: Stage) -> Row:
+def quality(stage: FieldStage, traced: FieldStage) -> Row:
     """Return errors of a stage of Lambert surfaces under a white sky, and the share of rays that it traces.
 
     Wrong rays are those that the field is sure of and wrong about; "unbiased" makes up for them. What the mode

@@ -105,13 +105,13 @@ def sponza(environment: object) -> gi.Scene:
     return peer_scene(scene, diffuse=True)
 
 
-def living_room(lamp: bool) -> gi.Scene:
+def living_room(lamp: bool, diffuse: bool = True) -> gi.Scene:
     """The living room, lit by a square lamp under its ceiling and its own back light, or by nothing but a white sky."""
     scene = gi.load_scene(SCENES / "living_room" / "living_room.obj", environment=None if lamp else (1.0, 1.0, 1.0))
     if lamp:
         mesh = quad((-0.9, 2.95, 1.6), (0.8, 0.0, 0.0), (0.0, 0.0, 0.8), light((14.0, 11.0, 8.0)), "lamp")
         scene = gi.Scene([*scene.nodes, gi.Node("lamp", [mesh])], scene.lights, None, scene.cameras, scene.name)
-    return peer_scene(scene, diffuse=True, emission=lamp)
+    return peer_scene(scene, diffuse=diffuse, emission=lamp)
 
 
 def spheres(environment: object) -> gi.Scene:

@@ -24,6 +24,7 @@ from warp_gi.kernels.light_field import (
     texel_direction,
     unpack_radiance,
 )
+from warp_gi.kernels.light_field_place import sees_back
 from warp_gi.kernels.octahedral import octahedral_decode, octahedral_wrap
 from warp_gi.kernels.path_trace import TERM_EMITTERS, TERM_ENVIRONMENT, PathSettings, trace_path
 from warp_gi.kernels.sampling import hash_uint, morton_code, sample_2d
@@ -36,8 +37,6 @@ LOBE = wp.constant(wp.float32(50.0))  # power of the cosine that distances are f
 LOBE_END = wp.constant(wp.float32(0.85))  # cosine below which its power, 3e-4, counts as 0
 SAME_DISTANCE = wp.constant(wp.float32(0.1))  # surfels that differ by less share their irradiance
 SAME_NORMAL = wp.constant(wp.float32(0.9))
-PLACE_STEPS = wp.constant(6)
-PLACE_BACK = wp.constant(wp.float32(0.25))  # share of back faces from which a probe looks for a way out
 JITTER_DIMENSION = wp.constant(0)
 PROBE_FACTOR = wp.constant(wp.uint32(2654435769))
 
@@ -100,15 +99,6 @@ def sample_texel(
     light = trace_path(scene, s, -direction, paths, index, seed)
     r.direct = light.environment + light.emitters
     return r
-
-
-# 1 where a ray meets the back of a triangle.
-@wp.func
-def sees_back(scene: SceneData, face: wp.int32, direction: wp.vec3) -> wp.int32:
-    ids = scene.geometry.indices[face]
-    p0 = scene.geometry.points[ids[0]]
-    front = wp.cross(scene.geometry.points[ids[1]] - p0, scene.geometry.points[ids[2]] - p0)
-    return wp.where(wp.dot(front, direction) > 0.0, 1, 0)
 
 
 # Thread: a texel of a probe. Its surfel, and its share of the direct light.
@@ -304,81 +294,3 @@ def find_nearest(first: wp.int32, field: LightField, work: ProbeWork):
             texel = octahedral_wrap(column + i, row + j, field.resolution)
             least = wp.min(least, surfel_distance(field.surfels[probe * field.resolution * field.resolution + texel]))
     field.nearest[probe * blocks * blocks + block] = least
-
-
-# What a point sees all around it.
-@wp.struct
-class Outlook:
-    back: wp.float32  # share of directions that meet the back of a triangle
-    nearest: wp.float32  # metres to the nearest front
-    towards: wp.vec3
-    nearest_back: wp.float32
-    towards_back: wp.vec3
-
-
-@wp.func
-def look_around(scene: SceneData, at: wp.vec3, directions: wp.int32) -> Outlook:
-    r = Outlook()
-    r.nearest = wp.inf
-    r.nearest_back = wp.inf
-    for k in range(directions):
-        # a spiral from pole to pole, evenly over the sphere
-        z = 1.0 - (2.0 * wp.float32(k) + 1.0) / wp.float32(directions)
-        angle = wp.float32(k) * 2.399963229728653
-        across = wp.sqrt(1.0 - z * z)
-        direction = wp.vec3(across * wp.cos(angle), z, across * wp.sin(angle))
-        hit = bvh_intersect(scene.bvh, at, direction, float(wp.inf))
-        if hit.face >= 0:
-            if sees_back(scene, hit.face, direction) != 0:
-                r.back += 1.0 / wp.float32(directions)
-                if hit.t < r.nearest_back:
-                    r.nearest_back = hit.t
-                    r.towards_back = direction
-            elif hit.t < r.nearest:
-                r.nearest = hit.t
-                r.towards = direction
-    return r
-
-
-# Thread: a point. Sets the share of directions in which it sees the back of a triangle.
-@wp.kernel
-def measure_backs(
-    first: wp.int32,
-    scene: SceneData,
-    points: wp.array(dtype=wp.vec3),
-    directions: wp.int32,
-    backs: wp.array(dtype=wp.float32),
-):
-    i = first + wp.tid()
-    backs[i] = look_around(scene, points[i], directions).back
-
-
-# Thread: a probe. Moves it out of what it is inside of, or away from a wall that is too near, by at most `most` along
-# each axis: through the nearest back face, or straight away from the nearest front.
-@wp.kernel
-def place_probes(
-    first: wp.int32, scene: SceneData, field: LightField, most: wp.vec3, clearance: wp.float32, directions: wp.int32
-):
-    probe = first + wp.tid()
-    home = field.positions[probe]
-    at = home
-    best = home
-    best_back = float(2.0)
-    best_room = float(0.0)
-    steps = int(PLACE_STEPS)
-    for _step in range(steps):
-        view = look_around(scene, at, directions)
-        room = wp.min(view.nearest, clearance)
-        if view.back < best_back - 0.05 or (view.back < best_back + 0.05 and room > best_room):
-            best = at
-            best_back = view.back
-            best_room = room
-        if view.back > PLACE_BACK and view.nearest_back < wp.inf:
-            at = at + view.towards_back * (view.nearest_back + clearance)
-        elif view.nearest < clearance:
-            at = at - view.towards * (clearance - view.nearest)
-        else:
-            break
-        for axis in range(3):
-            at[axis] = wp.clamp(at[axis], home[axis] - most[axis], home[axis] + most[axis])
-    field.positions[probe] = best

@@ -11,10 +11,12 @@ import warp as wp
 from PIL import Image
 
 import warp_gi as gi
-from warp_gi import cli, launch, sequence
+from warp_gi import cli, cli_techniques, launch, sequence
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels.octahedral import octahedral_decode, octahedral_wrap
 from warp_gi.techniques import visibility_export as export
+from warp_gi.techniques.light_field_probes import LightFieldProbes
+from warp_gi.techniques.light_field_state import ProbeState
 from warp_gi.techniques.visibility_field import VisibilityField
 from warp_gi.techniques.visibility_state import FieldState
 
@@ -73,12 +75,16 @@ def test_equal_bakes_but_for_their_seconds(whole, tmp_path):
 
 
 BAKE = ["bake", "cornell_box", *SETTINGS]
+LIGHT = {"resolution": "32", "irradiance-resolution": "8", "rays": "1", "bounces": "3"}
+COUNTS = ["3", "2", "2"]
+OF_PROBES = ["--technique=light-field-probes", *[f"--{name}={value}" for name, value in LIGHT.items()]]
+PROBES = ["bake", "cornell_box", *OF_PROBES, "--counts", *COUNTS]
 BAD = [
     (
         [*BAKE, "--technique", "visibility-feild"],
         "unknown technique 'visibility-feild'; did you mean 'visibility-field'",
     ),
-    ([*BAKE, "--technique=field"], "known: visibility-field"),
+    ([*BAKE, "--technique=field"], "(known: light-field-probes, visibility-field)"),
     (["bake", "cornel_box"], "did you mean 'cornell_box'?"),
     ([*BAKE, "--cel-size", "1"], "did you mean --cell-size?"),
     ([*BAKE, "--rays", "0"], "rays must be a whole number"),
@@ -88,6 +94,21 @@ BAD = [
     ([*BAKE, "-o", "a.txt"], "bakes are .safetensors files"),
     ([*BAKE, "-o", "/dev/null/a.safetensors"], "/dev/null"),
     ([*BAKE, "--export", "a.gif"], ".png files, one a layer, or one .exr"),
+    (
+        [*BAKE, "--no-relocate"],
+        "--no-relocate is a setting of light-field-probes, but visibility-field is baked; leave it out, or give",
+    ),
+    (
+        [*PROBES, "--cell-size=0.5"],
+        "--cell-size is a setting of visibility-field, but light-field-probes is baked; leave it out, or give",
+    ),
+    ([*PROBES, "--everywhere"], "probes are always baked for the whole scene: omit it"),
+    ([*PROBES, "--export", "a.png"], "atlases of probes are .exr files; give NAME.exr"),
+    ([*PROBES, "--primary", "probes"], "is a way to render; bake without it"),
+    ([*PROBES, "--irradiance-resolution", "3"], "irradiance_resolution must be a whole number from 4 to 128, got 3"),
+    ([*PROBES, "--spacing", "0.5"], "spacing and counts along every axis contradict each other"),
+    (["bake", "--technique=light-field-probes", "--counts", *["1000"] * 3], "1000 x 1000 x 1000 probes of 256 x 256"),
+    (["bake", "--technique=light-field-probes", "--count", "2"], "did you mean --counts?"),
     ([*BAKE, "--picture", "12"], "resolution '12' not understood"),
     ([*BAKE, "--device", "cuda:77"], "device 'cuda:77' is not available"),
     (["render", "cornell_box", "--bake", "none.safetensors"], "none.safetensors: no such file"),
@@ -297,8 +318,108 @@ def test_a_turning_sky_resumes(whole, sky, tmp_path, capsys, monkeypatch):
     assert "1 of 4 frames are there already" in told and "rendered again: scene_hash" in told  # frame 0 is the same
 
 
+@pytest.fixture(scope="module")
+def probes(tmp_path_factory):
+    """A bake of probes under a sky, its atlases and pictures; the folder, and what was printed."""
+    folder = tmp_path_factory.mktemp("probes")
+    command = [sys.executable, "-m", "warp_gi.cli", *PROBES, "--environment=0.2,0.3,0.4"]
+    more = ["--picture=96x64", "--show", "pictures", "--export", "atlases/box.exr"]
+    result = subprocess.run([*command, *more], cwd=folder, capture_output=True, text=True, timeout=300)
+    assert (result.returncode, result.stderr) == (0, ""), result
+    return folder, result.stdout
+
+
+def test_probes_are_baked_exported_and_shown(probes):
+    folder, _ = probes
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    atlases = {f"atlases/box.{name}.exr" for name in ("radiance", "normal", "distance", "irradiance", "moments")}
+    pictures = {f"pictures/{name}.png" for name in ("radiance", "normal", "distance", "irradiance", "places", "ray")}
+    assert files == {"out/cornell_box.probes.safetensors", "atlases/box.json"} | atlases | pictures
+    bake = gi.load_bake(folder / "out" / "cornell_box.probes.safetensors")
+    assert bake.technique == "LightFieldProbes" and bake.settings["counts"] == "3x2x2"
+    assert json.loads((folder / "atlases" / "box.json").read_text())["atlases"]["radiance"]["size"] == 32
+    places = np.asarray(Image.open(folder / "pictures" / "places.png"))
+    assert places.shape[0] > 64 and places[:64, :96].max() > 200
+
+
+def test_the_closing_tables_say_what_was_baked(probes):
+    folder, printed = probes
+    path = folder / "out" / "cornell_box.probes.safetensors"
+    bake = gi.load_bake(path)
+    rows = {}
+    for line in printed.splitlines():
+        parts = [part.strip() for part in line.strip().split("  ") if part.strip()]
+        if len(parts) == 2:
+            rows[parts[0]] = parts[1]
+    assert (rows["probes"], rows["probes usable"], rows["probes covered"]) == ("12", "12", "0")
+    assert (rows["grid"], rows["map of a probe"], rows["map of irradiance"]) == ("3 x 2 x 2", "32 x 32", "8 x 8")
+    assert rows["texels"] == rows["rays"] == f"{12 * 32 * 32:,}"
+    assert float(rows["million rays a second"]) > 0 and float(rows["seconds"]) > 0
+    assert float(rows["file [MB]"]) == pytest.approx(path.stat().st_size / 1e6, rel=1e-3)
+    settings = LightFieldProbes(counts=(3, 2, 2), resolution=32, irradiance_resolution=8, rays=1, bounces=3)
+    state = ProbeState(gi.builtin_scene("cornell_box"), wp.get_device("cpu"), settings, 1, bake)
+    assert cli_techniques.map_bytes(bake) == state.nbytes
+    assert float(rows["maps in memory [MB]"]) == pytest.approx(state.nbytes / 1e6, rel=1e-3)
+    assert rows["bounces"] == "3" and [float(rows[str(n)]) for n in (1, 2, 3)] == pytest.approx(state.changes, rel=1e-3)
+    assert rows["change of the last"] == rows["3"]
+    assert "more than the tolerance of 0.005: give more --bounces than 3" in printed
+    assert "atlases: atlases/box.radiance.exr to box.moments.exr, described by atlases/box.json" in printed
+
+
+@pytest.mark.parametrize("mode", ["irradiance", "hybrid", "traced"])
+def test_rendering_takes_baked_probes(probes, tmp_path, mode):
+    """With the bake pictures are the same as without; and it is the file that is read."""
+    folder, _ = probes
+    path = folder / "out" / "cornell_box.probes.safetensors"
+    of_render = [f"--indirect.{name}={value}" for name, value in LIGHT.items()] + ["--indirect.counts", *COUNTS]
+    small = ["cornell_box", "--environment=0.2,0.3,0.4", "--resolution=48x32", "--spp=2", "--pipeline=probes"]
+    command = ["render", *small, f"--indirect.mode={mode}", *of_render, "--frames=0", "--quiet"]
+    changed = gi.load_bake(path)
+    changed.arrays["radiance"] //= 2
+    changed.arrays["irradiance"] *= 2
+    changed.save(tmp_path / "changed.safetensors")
+    made = []
+    for name, more in (("made", []), ("given", [path]), ("changed", [tmp_path / "changed.safetensors"])):
+        given = [argument for bake in more for argument in ("--bake", str(bake))]
+        assert cli.main([*command, *given, "-o", str(tmp_path / f"{name}.exr")]) == 0
+        made.append(sequence.read_frame(tmp_path / f"{name}.exr").numpy("indirect"))
+    np.testing.assert_array_equal(made[0], made[1])
+    assert made[0].max() > 0.05 and np.abs(made[0] - made[2]).max() > 0.05
+
+
+def test_a_bake_of_probes_is_rendered_alone_and_fits_only_its_settings(probes, tmp_path, capfd, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = probes[0] / "out" / "cornell_box.probes.safetensors"
+    assert cli.main(["render", str(path), "--resolution=48x32", "--spp=1", "--frames=0", "--quiet", "-o", "a.exr"]) == 0
+    frame = sequence.read_frame(tmp_path / "a.exr")
+    assert frame.numpy("indirect").max() > 0.05 and np.isfinite(frame.numpy("depth")).any()
+    out = ["--frames=0", "-o", "new/a.exr", "--quiet"]
+    fails(["render", "cornell_box", "--pipeline=probes", *out, "--bake", path], "counts: bake has '3x2x2'", capfd)
+    fails(["render", "cornell_box", "--pipeline=dvf", *out, "--bake", path], "a bake of LightFieldProbes was", capfd)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
+
+
+def test_probes_need_no_camera_and_settled_light_no_advice(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "floor.obj").write_text("v -1 0 -1\nv 1 0 -1\nv 1 0 1\nv -1 0 1\nf 4 3 2 1\n")
+    command = ["bake", "floor.obj", *OF_PROBES, "--counts", "1", "1", "1", "--environment=1", "--tolerance=0.5"]
+    assert cli.main(command) == 0
+    printed = capsys.readouterr().out
+    assert "no camera" not in printed and "give more" not in printed and "1 x 1 x 1" in printed
+    assert cli.main([*command, "--show", "pictures"]) == 0
+    assert "the scene has no camera: showing all of it" in capsys.readouterr().out
+    assert (tmp_path / "pictures" / "places.png").exists() and (tmp_path / "out" / "floor.probes.safetensors").exists()
+
+
 def test_help(capsys):
     with pytest.raises(SystemExit):
         cli.main(["bake", "--help"])
     printed = capsys.readouterr().out
     assert all(word in printed for word in ("usage: warp-gi bake", "--cell-size", "--everywhere", "--export"))
+    assert "light-field-probes" in printed and "--counts INT" not in printed
+    for arguments in (["--technique", "light-field-probes", "--help"], ["--help", "--technique=light-field-probes"]):
+        with pytest.raises(SystemExit):
+            cli.main(["bake", *arguments])
+        printed = capsys.readouterr().out
+        assert all(word in printed for word in ("visibility-field", "--counts INT", "--resolution", "--export"))
+        assert "--cell-size FLOAT" not in printed

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import warp_gi as gi
-from warp_gi.bench import dvf, dvf_peers, dvf_views, path, presets
+from warp_gi.bench import dvf, dvf_peers, dvf_views, path, presets, stages
 
 SIZE = (24, 16)
 
@@ -54,7 +54,7 @@ def test_settings_sample_counts_and_coats_each_make_a_table(view, monkeypatch):
 def test_equal_error_bake_rate_and_relighting(view, monkeypatch):
     monkeypatch.setattr(path, "REPETITIONS", 2)
     monkeypatch.setattr(dvf_peers, "SPP", 8)
-    place = dvf_views.Place("box", lambda: view.scene, lambda: view.camera, 1.0, "", {"cell_size": 0.5})
+    place = stages.Place("box", lambda: view.scene, lambda: view.camera, 1.0, "", {"cell_size": 0.5})
     sky = dvf_peers.smooth_sky()
     np.testing.assert_allclose(sky.mean_radiance, 1.0, atol=1e-3)
     assert sky.pixels.min() > 0.1

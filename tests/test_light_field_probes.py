@@ -12,7 +12,8 @@ from warp_gi.bench.presets import light, quad, sphere
 from warp_gi.kernels import denoise as denoise_kernels
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_bake as bake_kernels
-from warp_gi.techniques.light_field_state import ProbeState, lit_data, low_directions, probe_grid
+from warp_gi.techniques.light_field_places import lit_data, probe_grid
+from warp_gi.techniques.light_field_state import ProbeState, low_directions
 
 wp.set_module_options({"enable_backward": False})
 
@@ -311,7 +312,7 @@ def test_a_saved_bake_renders_the_same_and_fits_only_its_scene(tmp_path):
 
 def test_a_still_scene_settles_and_a_changed_sky_is_followed():
     """A few frames after the sky changed, probes are where a new bake would be; then nothing more is traced."""
-    settings = {**SMALL, "resolution": 64, "update": 4, "hysteresis": 0.3, "mode": "irradiance"}
+    settings = {**SMALL, "resolution": 128, "update": 4, "hysteresis": 0.3, "mode": "irradiance"}
     camera = gi.Camera.look_at((0, 1.5, 1.5), (0, -1, 0), hfov=60, resolution=(16, 12))
     ball = sphere((0, -0.4, 0), 0.3, gi.Material("ball", (0.8,) * 3, specular=0.0))
     floor = walls(gi.Material("floor", (0.5,) * 3, specular=0.0))[0]

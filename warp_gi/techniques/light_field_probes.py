@@ -16,7 +16,8 @@ from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_trace as trace_kernels
-from warp_gi.techniques.light_field_state import ProbeState, lit_data
+from warp_gi.techniques.light_field_places import lit_data
+from warp_gi.techniques.light_field_state import ProbeState
 
 _MODES = {
     "irradiance": trace_kernels.MODE_IRRADIANCE,

@@ -3,114 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_gi import launch
-from warp_gi.alias import AliasTable
 from warp_gi.baking import Bake
-from warp_gi.errors import OptionError
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_bake as bake_kernels
-from warp_gi.kernels import types
 from warp_gi.techniques.baselines import sky_probability
+from warp_gi.techniques.light_field_places import ProbeGrid, lit_bounds, lit_data, probe_grid, relocate
 
-AUTOMATIC_PROBES = 64
-"""About as many as there are where neither counts nor spacing are given; the paper's living room has 4 x 4 x 4."""
-INSET = 0.35
-"""Distance of the outermost probes from the border, in distances between probes: where points by a wall have a probe
-near and light is as it is in the room. At 0.5 rooms come out 5 to 10 % too bright, at 0.2 coarse grids lose light."""
-MOST_PROBES = 1 << 20
-MOST_TEXELS = (1 << 31) - 1
-"""Of all maps together: kernels count them in 32 bits."""
 LIGHT_RESOLUTION, DISTANCE_RESOLUTION = 32, 64
 """Texels along a side of what irradiance and moments are filtered from, each the mean over the texels in it."""
 SHARING_RESOLUTION, LAST_SHARING_RESOLUTION = 64, 128
 """Texels along a side of a map that look irradiance up for themselves, while light bounces and at last."""
 BIAS = 0.05
 """Share of the smallest distance between probes by which a point leaves its surface before it asks who sees it."""
-CLEARANCE = 0.1
-"""Share of the smallest distance between probes that a moved probe keeps from walls."""
 COVERED_SHARE = 0.5
 """A probe that sees back faces in more directions than this is inside of something."""
-SLABS, LOOKS = 24, 64
-"""Points along each axis, and directions from each, that find out where there is free space."""
-FREE_SHARE, SLAB_SHARE = 0.25, 0.1
-"""A point is free if it sees fewer back faces; a slab counts with this share of the free points of the best one."""
-PLACE_LOOKS = 256
 BATCH_TEXELS = 1 << 20
 """Traced between two reports of progress."""
-
-
-@dataclass(frozen=True)
-class ProbeGrid:
-    """Where probes stand: on a regular grid over the scene."""
-
-    low: np.ndarray
-    """float64 [3], metres: probe (0, 0, 0)."""
-    spacing: np.ndarray
-    """float64 [3], metres."""
-    counts: tuple[int, int, int]
-    """Probes along x, y, z."""
-
-    @property
-    def probe_count(self) -> int:
-        """Number of probes."""
-        return math.prod(self.counts)
-
-    def positions(self) -> np.ndarray:
-        """Return float64 [probe, 3], x fastest, then y."""
-        z, y, x = np.meshgrid(*(np.arange(n) for n in self.counts[::-1]), indexing="ij")
-        return self.low + np.stack([x, y, z], axis=-1).reshape(-1, 3) * self.spacing
-
-
-def probe_grid(bounds: np.ndarray, counts: Sequence[int], spacing: float, resolution: int) -> ProbeGrid:
-    """Return the grid over ``bounds`` [2, 3] with so many probes along each axis, or so many metres between them.
-
-    Counts of 0 follow from the spacing; without either there are about 64 probes, as evenly spaced as possible.
-    Raises OptionError for more probes than can be held.
-    """
-    low, high = bounds.astype(np.float64)
-    extent = np.maximum(high - low, 1e-3 * max(float((high - low).max()), 1e-3))  # a flat scene has a little height
-    step = spacing or float(np.prod(extent) / AUTOMATIC_PROBES) ** (1 / 3)
-    least = 1 if spacing else 2  # eight probes around every point, unless told otherwise
-    found = tuple(int(n) or max(least, round(min(e / step, 1e9))) for n, e in zip(counts, extent, strict=True))
-    texels = math.prod(found) * resolution**2
-    if math.prod(found) > MOST_PROBES or texels > MOST_TEXELS:
-        raise OptionError(
-            f"{' x '.join(map(str, found))} probes of {resolution} x {resolution} texels are more than the "
-            f"{MOST_PROBES:,} probes or {MOST_TEXELS:,} texels that are supported; use fewer or smaller ones"
-        )
-    along = np.array(found)
-    cells = extent / np.where(along > 1, along - 1 + 2 * INSET, 1.0)
-    return ProbeGrid((low + high) / 2 - cells * (along - 1) / 2, cells, found)
-
-
-def free_bounds(scene: Any, data: Any, device: wp.Device) -> np.ndarray:
-    """Return the box around the space that light is in, float64 [2, 3]; the scene's bounds if faces do not tell.
-
-    Bounds of a room reach behind its walls, to lamps above the ceiling and trees before the window. Points there see
-    walls from behind. The box is that of the slabs in which enough points do not.
-    """
-    bounds = scene.bounds.astype(np.float64)
-    at = (np.arange(SLABS) + 0.5) / SLABS
-    share = np.stack(np.meshgrid(at, at, at, indexing="ij"), axis=-1).reshape(-1, 3)
-    points = wp.array((bounds[0] + share * (bounds[1] - bounds[0])).astype(np.float32), dtype=wp.vec3, device=device)
-    backs = wp.empty(len(share), dtype=wp.float32, device=device)
-    launch.launch(bake_kernels.measure_backs, len(share), [data, points, LOOKS, backs], device, smallest_slice=16)
-    free = (backs.numpy() < FREE_SHARE).reshape(SLABS, SLABS, SLABS)
-    box = bounds.copy()
-    for axis in range(3):
-        slab = free.sum(axis=tuple(other for other in range(3) if other != axis))
-        used = np.flatnonzero(slab >= max(SLAB_SHARE * slab.max(), 1))
-        if len(used):
-            size = (bounds[1, axis] - bounds[0, axis]) / SLABS
-            box[:, axis] = bounds[0, axis] + size * np.array([used[0], used[-1] + 1])
-    return box
 
 
 def low_directions(resolution: int) -> np.ndarray:
@@ -137,7 +52,7 @@ class ProbeState:
     def __init__(self, scene: Any, device: wp.Device, settings: Any, seed: int, bake: Bake | None = None) -> None:
         self.device, self.settings, self.seed = device, settings, seed
         if bake is None:
-            box = free_bounds(scene, scene.data(device), device)
+            box = lit_bounds(scene, device)
             self.grid = probe_grid(box, settings.counts, settings.spacing, settings.resolution)
             bounds = scene.bounds
         else:
@@ -191,10 +106,7 @@ class ProbeState:
         settings, told = self.settings, progress or (lambda share: None)
         data = lit_data(scene, self.device)
         if settings.relocate:
-            most = wp.vec3(*(0.5 * self.grid.spacing))
-            clearance = CLEARANCE * float(self.grid.spacing.min())
-            inputs = [data, self.field, most, clearance, PLACE_LOOKS]
-            self._launch(bake_kernels.place_probes, self.grid.probe_count, inputs)
+            relocate(scene, data, self.grid, self.field, self.device)
         every = np.arange(self.grid.probe_count)
         work = self._work(every, settings.rays, scene, with_emission=scene.emitter_count > 0)
         self._trace(data, work, every, lambda share: told(0.8 * share))
@@ -337,15 +249,6 @@ class ProbeState:
         field = self.field
         arrays = (field.radiance, field.surfels, field.nearest, field.irradiance, field.moments, field.emission)
         return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays)
-
-
-def lit_data(scene: Any, device: wp.Device) -> types.SceneData:
-    """Return the scene's buffers with emitters picked by power, whatever the pipeline's estimator of them does."""
-    data = launch.copied(scene.data(device), types.SceneData)
-    data.emitters = launch.copied(data.emitters, types.Emitters)
-    if scene.emitter_count:
-        data.emitters.alias = AliasTable.build(scene.emitter_powers()).on(device)
-    return data
 
 
 def _part(work: Any, start: int, stop: int, texels: int) -> Any:

@@ -1,0 +1,151 @@
+"""Where light field probes stand: what points in a scene see all around them, and the way out of walls."""
+
+import warp as wp
+
+from warp_gi.kernels.bvh import bvh_intersect, bvh_occluded
+from warp_gi.kernels.environment import environment_radiance
+from warp_gi.kernels.light_field import LightField
+from warp_gi.kernels.path_trace import TERM_EMITTERS, TERM_ENVIRONMENT, TERM_INDIRECT, PathSettings, trace_path
+from warp_gi.kernels.sampling import hash_uint
+from warp_gi.kernels.surface import surface_at, surface_emission
+from warp_gi.kernels.types import SceneData
+
+wp.set_module_options({"enable_backward": False})
+
+PLACE_STEPS = wp.constant(6)
+PLACE_BACK = wp.constant(wp.float32(0.25))  # share of back faces from which a probe looks for a way out
+LIGHT_DEPTH = wp.constant(6)  # edges of the longest path that says where light is
+POINT_FACTOR = wp.constant(wp.uint32(2654435769))
+
+
+# 1 where a ray meets the back of a triangle.
+@wp.func
+def sees_back(scene: SceneData, face: wp.int32, direction: wp.vec3) -> wp.int32:
+    ids = scene.geometry.indices[face]
+    p0 = scene.geometry.points[ids[0]]
+    front = wp.cross(scene.geometry.points[ids[1]] - p0, scene.geometry.points[ids[2]] - p0)
+    return wp.where(wp.dot(front, direction) > 0.0, 1, 0)
+
+
+# Direction k of so many on a spiral from pole to pole, evenly over the sphere.
+@wp.func
+def spiral_direction(k: wp.int32, count: wp.int32) -> wp.vec3:
+    y = 1.0 - (2.0 * wp.float32(k) + 1.0) / wp.float32(count)
+    angle = wp.float32(k) * 2.399963229728653
+    across = wp.sqrt(1.0 - y * y)
+    return wp.vec3(across * wp.cos(angle), y, across * wp.sin(angle))
+
+
+# What a point sees all around it.
+@wp.struct
+class Outlook:
+    back: wp.float32  # share of directions that meet the back of a triangle
+    nearest: wp.float32  # metres to the nearest front
+    towards: wp.vec3
+    nearest_back: wp.float32
+    towards_back: wp.vec3
+
+
+@wp.func
+def look_around(scene: SceneData, at: wp.vec3, directions: wp.int32) -> Outlook:
+    r = Outlook()
+    r.nearest = wp.inf
+    r.nearest_back = wp.inf
+    for k in range(directions):
+        direction = spiral_direction(k, directions)
+        hit = bvh_intersect(scene.bvh, at, direction, float(wp.inf))
+        if hit.face >= 0:
+            if sees_back(scene, hit.face, direction) != 0:
+                r.back += 1.0 / wp.float32(directions)
+                if hit.t < r.nearest_back:
+                    r.nearest_back = hit.t
+                    r.towards_back = direction
+            elif hit.t < r.nearest:
+                r.nearest = hit.t
+                r.towards = direction
+    return r
+
+
+# Thread: a direction from a point. Sets the mean over the channels of the light that a path finds there, all of it;
+# -1 where it meets the back of a triangle.
+@wp.kernel
+def measure_light(
+    first: wp.int32,
+    scene: SceneData,
+    points: wp.array(dtype=wp.vec3),
+    directions: wp.int32,
+    sky_probability: wp.float32,
+    light: wp.array(dtype=wp.float32),
+):
+    i = first + wp.tid()
+    point = i / directions
+    direction = spiral_direction(i - point * directions, directions)
+    hit = bvh_intersect(scene.bvh, points[point], direction, float(wp.inf))
+    if hit.face < 0:
+        sky = environment_radiance(scene.environment, direction)
+        light[i] = (sky[0] + sky[1] + sky[2]) / 3.0
+        return
+    if sees_back(scene, hit.face, direction) != 0:
+        light[i] = -1.0
+        return
+    paths = PathSettings()
+    paths.terms = TERM_ENVIRONMENT | TERM_EMITTERS | TERM_INDIRECT
+    paths.max_depth = LIGHT_DEPTH
+    paths.roulette_depth = LIGHT_DEPTH
+    paths.sky_probability = sky_probability
+    s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
+    seed = hash_uint(wp.uint32(point) * POINT_FACTOR)
+    path = trace_path(scene, s, -direction, paths, wp.uint32(i - point * directions), seed)
+    total = path.environment + path.emitters + path.indirect
+    total = total + surface_emission(scene, hit.face, hit.u, hit.v, -direction)
+    light[i] = (total[0] + total[1] + total[2]) / 3.0
+
+
+# Thread: a point. Sets whether any of some eyes sees it, 0 or 1.
+@wp.kernel
+def find_seen(
+    first: wp.int32,
+    scene: SceneData,
+    eyes: wp.array(dtype=wp.vec3),
+    points: wp.array(dtype=wp.vec3),
+    seen: wp.array(dtype=wp.int32),
+):
+    i = first + wp.tid()
+    result = int(0)
+    for eye in range(eyes.shape[0]):
+        way = points[i] - eyes[eye]
+        if not bvh_occluded(scene.bvh, eyes[eye], way, 1.0):
+            result = int(1)
+            break
+    seen[i] = result
+
+
+# Thread: a probe. Moves it out of what it is inside of, or away from a wall that is too near, by at most `most` along
+# each axis: through the nearest back face, or straight away from the nearest front.
+@wp.kernel
+def place_probes(
+    first: wp.int32, scene: SceneData, field: LightField, most: wp.vec3, clearance: wp.float32, directions: wp.int32
+):
+    probe = first + wp.tid()
+    home = field.positions[probe]
+    at = home
+    best = home
+    best_back = float(2.0)
+    best_room = float(0.0)
+    steps = int(PLACE_STEPS)
+    for _step in range(steps):
+        view = look_around(scene, at, directions)
+        room = wp.min(view.nearest, clearance)
+        if view.back < best_back - 0.05 or (view.back < best_back + 0.05 and room > best_room):
+            best = at
+            best_back = view.back
+            best_room = room
+        if view.back > PLACE_BACK and view.nearest_back < wp.inf:
+            at = at + view.towards_back * (view.nearest_back + clearance)
+        elif view.nearest < clearance:
+            at = at - view.towards * (clearance - view.nearest)
+        else:
+            break
+        for axis in range(3):
+            at[axis] = wp.clamp(at[axis], home[axis] - most[axis], home[axis] + most[axis])
+    field.positions[probe] = best
