@@ -7,13 +7,10 @@ that no probe can follow to its end is unknown; its last occluder counts as its 
 
 from __future__ import annotations
 
-import argparse
-
 import numpy as np
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.bench import runner
 from warp_gi.bench.probes_views import CORNELL, LIVING_ROOM, SPONZA, View, view_of
 from warp_gi.bench.stages import Place, Row, race
 from warp_gi.kernels import light_field_march as march_kernels
@@ -28,7 +25,7 @@ COUNTS = ((2, 2, 2), (1, 4, 1), (4, 4, 4), (6, 4, 6), (8, 4, 8))
 RAYS = 100_000
 
 
-def ray_rows(quick: bool = False, device: str = "cpu") -> list[Row]:
+def ray_rows(quick: bool, device: str) -> list[Row]:
     """Return a row for each place and grid."""
     rows: list[Row] = []
     for place in (LIVING_ROOM, SPONZA, CORNELL):
@@ -131,18 +128,3 @@ def agreement(hits: dict[str, np.ndarray], is_hit: np.ndarray, t: np.ndarray) ->
         "blocks a ray": float(blocks),
         "probes a ray": float(probes),
     }
-
-
-def main() -> None:
-    """Print the rows, as tables and as lines of JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="fewer rays and grids")
-    parser.add_argument("--device", default="cpu")
-    options = parser.parse_args()
-    rows = ray_rows(options.quick, options.device)
-    runner.print_rows("probes", rows)
-    print(runner.json_lines("probes", rows, options.quick, options.device), end="")
-
-
-if __name__ == "__main__":
-    main()

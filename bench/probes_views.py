@@ -30,10 +30,13 @@ CORNELL = Place("Cornell box", _cornell, lambda: CORNELL_VIEW)
 LIVING_ROOM = Place(
     "living room", partial(presets.living_room, lamp=True), lambda: presets.LIVING_ROOM_VIEW, 50.0, _LIVING_ROOM
 )
+ROOM_VIEW = gi.Camera.look_at((0, 1.3, 1.2), (0.3, 1.1, 6), hfov=60.0)
+"""The other way, into the living room; `presets.LIVING_ROOM_VIEW` is near its windows."""
+ROOM = Place("living room, all", partial(presets.living_room, lamp=True), lambda: ROOM_VIEW, 50.0, _LIVING_ROOM)
 GLOSSY_LIVING_ROOM = Place(
     "living room, its materials",
     partial(presets.living_room, lamp=True, diffuse=False),
-    lambda: presets.LIVING_ROOM_VIEW,
+    lambda: ROOM_VIEW,
     0.0,
     _LIVING_ROOM,
 )

@@ -121,6 +121,18 @@ class Frame:
         if paths is not None:
             self._paths = paths
 
+    def launch_paths(self) -> None:
+        """Trace the terms that were asked for since the camera sample began, in one launch."""
+        paths = path_trace.PathSettings()
+        paths.terms = self._path_terms
+        paths.max_depth = self._paths.max_depth
+        paths.roulette_depth = self._paths.roulette_depth
+        paths.clamp = self._paths.clamp
+        paths.sky_probability = self._sky_probability
+        buffers = self.struct(path_trace.PathBuffers)
+        inputs = [self.data, self.camera_data, self.pass_settings, paths, self.hits, buffers]
+        self.launch_tiled(path_trace.trace_paths, inputs)
+
     def moments(self, name: str) -> tuple[wp.array, wp.array]:
         """Return sums of an independent launch's samples and of their squares, which the variance buffer adds."""
         if self._arrays.get(f"{name}_moment1") is None:
@@ -364,16 +376,7 @@ class FrameScheduler:
             with frame.stage(term):
                 estimator.trace(frame, self._states[term])
         with frame.stage("paths"):
-            paths = path_trace.PathSettings()
-            paths.terms = frame._path_terms
-            paths.max_depth = frame._paths.max_depth
-            paths.roulette_depth = frame._paths.roulette_depth
-            paths.clamp = frame._paths.clamp
-            paths.sky_probability = frame._sky_probability
-            buffers = frame.struct(path_trace.PathBuffers)
-            frame.launch_tiled(
-                path_trace.trace_paths, [frame.data, frame.camera_data, settings, paths, frame.hits, buffers]
-            )
+            frame.launch_paths()
 
 
 def render(

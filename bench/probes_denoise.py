@@ -1,0 +1,83 @@
+"""Denoisers on a moving camera: error before and after, by rays a pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+import warp_gi as gi
+from warp_gi.bench import presets
+from warp_gi.bench.stages import Row
+from warp_gi.errors import OptionError
+
+FRAME = 7
+"""That is judged; the frames before it are what the denoiser remembers."""
+RAYS = (1, 2, 8)
+DENOISERS = {"spatiotemporal": "ST", "oidn": "OIDN"}
+
+
+def _atrium() -> tuple[gi.Scene, gi.CameraPath]:
+    return gi.builtin_scene("atrium"), gi.builtin_camera_path("atrium")
+
+
+def _cornell() -> tuple[gi.Scene, gi.CameraPath]:
+    scene = presets.peer_scene(gi.builtin_scene("cornell_box"), diffuse=True)
+    return scene, gi.builtin_camera_path("cornell_box")
+
+
+CASES: dict[str, Callable[[], tuple[gi.Scene, gi.CameraPath]]] = {"cornell_box": _cornell, "atrium": _atrium}
+PIPELINES: dict[str, dict[str, Any]] = {
+    "paths": {},
+    "probes, traced": {"indirect": gi.LightFieldProbes(mode="traced", resolution=128)},
+}
+
+
+def denoise_rows(quick: bool, device: str) -> list[Row]:
+    """Return a row for each scene, pipeline and number of rays: the beauty against that of the pipeline's many rays."""
+    size, spp = ((240, 135), 64) if quick else ((480, 270), 256)
+    rows: list[Row] = []
+    for name in list(CASES)[: 1 if quick else None]:
+        scene, path = CASES[name]()
+        for label, terms in PIPELINES.items():
+            rows += pipeline_rows(name, scene, path.at_resolution(*size), label, terms, spp, device)
+    return rows
+
+
+def pipeline_rows(
+    name: str, scene: gi.Scene, path: gi.CameraPath, label: str, terms: dict[str, Any], spp: int, device: str
+) -> list[Row]:
+    """Return the rows of one scene and pipeline."""
+    indirect = terms.get("indirect")
+    bakes = [gi.bake(scene, indirect, device)] if indirect is not None else []
+    many = gi.Pipeline(**terms, spp=spp, camera_samples=1)
+    truth = gi.FrameScheduler(scene, path, many, device, seed=101, bakes=bakes).frame(FRAME).numpy("beauty")
+    rows: list[Row] = []
+    for rays in RAYS:
+        row: Row = {"table": "denoise", "case": name, "pipeline": label, "rays a pixel": rays}
+        for denoiser, short in DENOISERS.items():
+            few = gi.Pipeline(**terms, spp=rays, camera_samples=1, denoise=denoiser)
+            try:
+                scheduler = gi.FrameScheduler(scene, path, few, device, seed=1, bakes=bakes)
+            except OptionError as missing:
+                row[f"{short} skipped"] = str(missing)
+                continue
+            seconds = []
+            for index in range(FRAME + 1):
+                frame = scheduler.frame(index)
+                seconds.append(frame.timings["denoise"])
+            if "noisy RMSE" not in row:
+                row |= _errors("noisy", frame.numpy("noisy"), truth)
+            row |= _errors(short, frame.numpy("beauty"), truth)
+            row[f"{short} ms"] = float(np.median(seconds)) * 1e3
+        rows.append(row)
+    return rows
+
+
+def _errors(name: str, picture: np.ndarray, truth: np.ndarray) -> Row:
+    return {
+        f"{name} RMSE": gi.metrics.rmse(picture, truth),
+        f"{name} relMSE": gi.metrics.rel_mse(picture, truth),
+        f"{name} FLIP": gi.metrics.flip(picture, truth),
+    }

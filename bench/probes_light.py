@@ -1,0 +1,191 @@
+"""Indirect light from probes beside the path tracer: errors and time of each mode, leaks, and what a bake takes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+import warp_gi as gi
+from warp_gi.bench.probes_views import (
+    CORNELL,
+    CYLINDERS,
+    GLOSSY_LIVING_ROOM,
+    LIVING_ROOM,
+    ROOM,
+    SPONZA,
+    View,
+    cylinder_box,
+    view_of,
+)
+from warp_gi.bench.stages import Place, Row, Stage, race, timed
+from warp_gi.techniques.light_field_places import lit_data
+
+SPP = 4
+"""Of the modes that trace rays."""
+PATH_SPP = 16
+"""That the path tracer's time and noise a sample are measured with."""
+PAPER_CARD = "GeForce 1080"
+PAPER_MS = (
+    ("Cornell Box", "2 x 2 x 2", 2048, 0.358, 0.000),
+    ("Cornell Box", "2 x 2 x 2", 256, 0.302, 0.000),
+    ("Sponza (Statue)", "8 x 2 x 4", 512, 0.332, 0.151),
+    ("Living Room", "4 x 4 x 4", 1024, 0.293, 4.401),
+    ("Luxury Kitchen", "4 x 4 x 4", 1024, 0.358, 9.334),
+    ("San Miguel", "8 x 2 x 8", 1024, 0.520, 47.170),
+)
+"""Its table 1: milliseconds at 1920x1080 for the Lambertian and the glossy term."""
+PAPER_BAKE = "60 to 120 s"
+
+
+# ---- leaks ----
+
+
+def leak_rows(quick: bool, device: str) -> list[Row]:
+    """Return rows of the dark room of two, with and without visibility, and of cylinders over probes."""
+    size, spp = ((96, 64), 64) if quick else ((240, 160), 256)
+    scene = gi.builtin_scene("two_rooms")
+    views = {name: View(scene, scene.cameras[name].at_resolution(*size), device, spp) for name in ("lit", "dark")}
+    views["dark"].bakes = views["lit"].bakes
+    rows: list[Row] = []
+    for resolution in (128,) if quick else (128, 256):
+        for counts in ((0, 0, 0), (8, 3, 4)):
+            for weights, relocate in (("visibility", True), ("visibility", False), ("trilinear", False)):
+                settings = {"counts": counts, "resolution": resolution, "weights": weights, "relocate": relocate}
+                rows.append(_leak_row(views, settings))
+    view = View(cylinder_box(), CYLINDERS().at_resolution(*size), device, spp)
+    for weights, relocate in (("visibility", True), ("visibility", False), ("trilinear", False)):
+        stage = view.stage(1, mode="irradiance", counts=(3, 2, 3), weights=weights, relocate=relocate)
+        row: Row = {"table": "cylinders over probes", "weights": weights, "relocate": relocate}
+        rows.append(row | {"covered": covered(stage)} | darkened(view, stage) | view.quality(stage.picture))
+    return rows
+
+
+def _leak_row(views: dict[str, View], settings: dict[str, Any]) -> Row:
+    means = {name: view.stage(1, mode="irradiance", **settings) for name, view in views.items()}
+    lit, dark = (float(means[name].picture.mean(dtype=np.float64)) for name in ("lit", "dark"))
+    paths = float(views["lit"].reference.mean(dtype=np.float64))
+    row: Row = {"table": "leaks: two_rooms", "probes": _counts(means["lit"]), "resolution": settings["resolution"]}
+    row |= {"weights": settings["weights"], "relocate": settings["relocate"], "covered": covered(means["lit"])}
+    return row | {"dark / lit": dark / lit, "target": 0.01, "lit / paths": lit / paths}
+
+
+def covered(stage: Stage) -> int:
+    """Return how many probes are inside of something."""
+    return int((stage.state.field.states.numpy() != 0).sum())
+
+
+def darkened(view: View, stage: Stage) -> Row:
+    """Return the share of what is seen whose indirect light is less than half, and more than twice, what it should be.
+
+    In blocks of 8 x 8 pixels, in which the path tracer's noise is small.
+    """
+    ours, paths = (_blocks(image) for image in (stage.picture, view.reference))
+    seen = paths > 0.05 * paths.mean()
+    return {
+        "below half": float((ours < 0.5 * paths)[seen].mean()),
+        "above twice": float((ours > 2 * paths)[seen].mean()),
+    }
+
+
+def _blocks(image: np.ndarray, size: int = 8) -> np.ndarray:
+    height, width = (n // size * size for n in image.shape[:2])
+    return image[:height, :width].reshape(height // size, size, width // size, size, 3).mean(axis=(1, 3, 4))
+
+
+def _counts(stage: Stage) -> str:
+    return " x ".join(map(str, stage.state.grid.counts))
+
+
+# ---- modes ----
+
+
+def light_rows(quick: bool, device: str) -> list[Row]:
+    """Return errors and times of the modes by place and grid, what the path tracer needs for the same, and table 1."""
+    grids: list[tuple[Place, list[dict[str, Any]]]] = [
+        (CORNELL, _grids((2, 2, 2), (4, 4, 4), (8, 8, 8))),
+        (LIVING_ROOM, _grids((4, 4, 4), (8, 4, 8))),
+        (ROOM, _grids((4, 4, 4), (8, 4, 8))),
+        (SPONZA, _grids((0, 0, 0), (8, 4, 4), (16, 8, 8))),
+        (GLOSSY_LIVING_ROOM, _grids((4, 4, 4), (8, 4, 8))),
+    ]
+    rows: list[Row] = []
+    for place, settings in grids:
+        if place.missing:
+            rows.append({"table": "indirect light", "case": place.name, "skipped": place.missing})
+            continue
+        view = view_of(place, (160, 90) if quick else (320, 180), device, 64 if quick else 512)
+        rows += mode_rows(place, view, settings[:1] if quick else settings, 3 if quick else 5)
+    for name, counts, resolution, lambertian, glossy in PAPER_MS:
+        row = {"table": f"table 1: paper, {PAPER_CARD}", "case": name, "probes": counts, "resolution": resolution}
+        rows.append(row | {"Lambertian ms": lambertian, "glossy ms": glossy})
+    return rows
+
+
+def _grids(*counts: tuple[int, int, int]) -> list[dict[str, Any]]:
+    return [{"counts": number} for number in counts]
+
+
+def mode_rows(place: Place, view: View, grids: list[dict[str, Any]], repetitions: int) -> list[Row]:
+    """Return rows of one place: of each mode and grid, beside the path tracer at equal time and equal error.
+
+    Its error falls with the root of its samples and it takes as long for each of them, so both follow from its noise
+    and its time at ``PATH_SPP``. Nothing is faster than one sample a pixel.
+    """
+    paths = view.paths(PATH_SPP)
+    noise = view.mean_squared(paths.picture) * PATH_SPP
+    rows: list[Row] = []
+    for settings in grids:
+        stages: dict[str, Stage] = {"paths": paths}
+        for mode in ("irradiance", "hybrid", "traced"):
+            stages[mode] = view.stage(1 if mode == "irradiance" else SPP, mode=mode, **settings)
+        times = race(stages, repetitions)
+        each = np.array(times["paths"]) / PATH_SPP
+        for mode, stage in stages.items():
+            if mode == "paths":
+                continue
+            wall, cpu = times[mode]
+            quality = view.quality(stage.picture)
+            needed = max(noise / max(quality["RMSE"] ** 2, 1e-30), 1.0)
+            row: Row = {"table": "indirect light", "case": place.name, "probes": _counts(stage), "mode": mode}
+            row |= {"spp": stage.spp} | quality
+            row |= {"ns a pixel": cpu / np.prod(view.camera.resolution) * 1e9, "wall s": wall}
+            row |= {"paths spp for this RMSE": needed, "faster, wall": needed * each[0] / wall}
+            row |= {"faster, cpu": needed * each[1] / cpu, "target": place.target if mode == "irradiance" else 0.0}
+            rows.append(row | {"paths RMSE in this time": float((noise / max(cpu / each[1], 1.0)) ** 0.5)})
+    return rows
+
+
+# ---- bakes ----
+
+
+def bake_rows(quick: bool, device: str) -> list[Row]:
+    """Return seconds and memory of bakes, passes until light had settled, and milliseconds to refresh a probe."""
+    rows: list[Row] = []
+    for place in (CORNELL, LIVING_ROOM, SPONZA):
+        if place.missing:
+            rows.append({"table": "bakes", "case": place.name, "skipped": place.missing})
+            continue
+        view = view_of(place, (32, 18), device, 1)
+        sizes = (64,) if quick else (256, 1024)
+        for resolution in sizes:
+            if resolution < 1024 or place is LIVING_ROOM:
+                rows.append(bake_row(place, view, resolution))
+    return [*rows, {"table": f"bakes: paper, {PAPER_CARD}", "all its scenes": PAPER_BAKE}]
+
+
+def bake_row(place: Place, view: View, resolution: int) -> Row:
+    """Return the row of one bake with 4 x 4 x 4 probes."""
+    settings = gi.LightFieldProbes(counts=(4, 4, 4), resolution=resolution)
+    bake, (wall, cpu) = view.bake(settings)
+    view.bakes.clear()
+    state = settings.start(view.scene, view.device, bake)
+    changes = state.changes
+    data, some = lit_data(view.scene, state.device), np.arange(8)
+    state.refresh(view.scene, data, some)
+    refreshes = [timed(lambda: state.refresh(view.scene, data, some))[1] for _ in range(5)]
+    update_wall, update_cpu = np.median(refreshes, axis=0) / len(some)
+    row: Row = {"table": "bakes", "case": place.name, "probes": "4 x 4 x 4", "resolution": resolution}
+    row |= {"wall s": wall, "cpu s": cpu, "million rays": bake.counts["rays"] / 1e6, "MB": state.nbytes / 1e6}
+    row |= {"passes": len(changes), "last change": changes[-1]}
+    return row | {"update ms a probe, wall": update_wall * 1e3, "update ms a probe, cpu": update_cpu * 1e3}
