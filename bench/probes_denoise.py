@@ -36,7 +36,7 @@ PIPELINES: dict[str, dict[str, Any]] = {
 
 def denoise_rows(quick: bool, device: str) -> list[Row]:
     """Return a row for each scene, pipeline and number of rays: the beauty against that of the pipeline's many rays."""
-    size, spp = ((240, 135), 64) if quick else ((480, 270), 256)
+    size, spp = ((240, 135), 64) if quick else ((480, 270), 512)
     rows: list[Row] = []
     for name in list(CASES)[: 1 if quick else None]:
         scene, path = CASES[name]()
