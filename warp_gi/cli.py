@@ -45,6 +45,8 @@ examples:
   warp-gi render hall.glb --resume ...               only the frames that are not there yet
   warp-gi bake hall.glb --cell-size 0.5              once for all skies, to out/hall.dvf.safetensors;
   warp-gi render hall.glb --pipeline dvf --bake out/hall.dvf.safetensors ...   uses it
+  warp-gi bake hall.glb --technique light-field-probes   indirect light, to out/hall.probes.safetensors
+  warp-gi render out/hall.probes.safetensors         what that bake holds, without the scene
   warp-gi compare out/hall.0000.exr reference.exr    RMSE, relMSE, PSNR, FLIP and a picture of the difference
 
 `warp-gi COMMAND --help` lists the options of a command. Errors are one line on stderr and exit code 2;
