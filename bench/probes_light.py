@@ -18,7 +18,7 @@ from warp_gi.bench.probes_views import (
     cylinder_box,
     view_of,
 )
-from warp_gi.bench.stages import Place, Row, Stage, race, timed
+from warp_gi.bench.stages import Place, Row, Stage, cost, race, timed
 from warp_gi.techniques.light_field_places import lit_data
 
 SPP = 4
@@ -149,7 +149,10 @@ def mode_rows(place: Place, view: View, grids: list[dict[str, Any]], repetitions
             needed = max(noise / max(quality["RMSE"] ** 2, 1e-30), 1.0)
             row: Row = {"table": "indirect light", "case": place.name, "probes": _counts(stage), "mode": mode}
             row |= {"spp": stage.spp} | quality
-            row |= {"ns a pixel": cpu / np.prod(view.camera.resolution) * 1e9, "wall s": wall}
+            row |= {
+                "ns a pixel": cost(times[mode], view.device) / np.prod(view.camera.resolution) * 1e9,
+                "wall s": wall,
+            }
             row |= {"paths spp for this RMSE": needed, "faster, wall": needed * each[0] / wall}
             row |= {"faster, cpu": needed * each[1] / cpu, "target": place.target if mode == "irradiance" else 0.0}
             rows.append(row | {"paths RMSE in this time": float((noise / max(cpu / each[1], 1.0)) ** 0.5)})

@@ -12,7 +12,7 @@ import numpy as np
 import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench.probes_views import CORNELL, LIVING_ROOM, SPONZA, View, view_of
-from warp_gi.bench.stages import Place, Row, race
+from warp_gi.bench.stages import Place, Row, cost, race
 from warp_gi.kernels import light_field_march as march_kernels
 from warp_gi.techniques.light_field_ray import march_rays
 
@@ -106,7 +106,7 @@ def ray_row(
         times = race({"march": lambda: march_rays(state, *rays), "tree": lambda: tree.intersect(*rays)}, repetitions)
     finally:
         launch.set_threads(threads)
-    rates = {name: len(rays[0]) / 1e6 / cpu for name, (_, cpu) in times.items()}
+    rates = {name: len(rays[0]) / 1e6 / cost(taken, view.device) for name, taken in times.items()}
     row: Row = {"table": "rays", "case": place.name, "probes": " x ".join(map(str, counts)), "resolution": resolution}
     row |= agree | {"Mrays/s": rates["march"], "tree Mrays/s": rates["tree"], "of tree": rates["march"] / rates["tree"]}
     return row | {"MB": state.nbytes / 1e6}

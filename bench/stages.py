@@ -72,6 +72,7 @@ def timed(work: Callable[[], Any]) -> tuple[Any, Times]:
     """Return what ``work`` does, and seconds without compilation."""
     compiled, wall, cpu = launch.compile_seconds, time.perf_counter(), time.process_time()
     result = work()
+    wp.synchronize()
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     compiled = launch.compile_seconds - compiled
     return result, (wall - compiled, max(cpu - compiled, 0.0))
@@ -89,10 +90,16 @@ def race(stages: Mapping[str, Stage | Callable[[], Any]], repetitions: int) -> d
         for name, stage in stages.items():
             wall, cpu = time.perf_counter(), time.process_time()
             (stage.trace if isinstance(stage, Stage) else stage)()
+            wp.synchronize()
             taken = time.perf_counter() - wall, time.process_time() - cpu
             if repetition:  # the first warms the caches
                 times[name].append(taken)
     return {name: tuple(np.median(values, axis=0).tolist()) for name, values in times.items()}
+
+
+def cost(times: Times, device: str) -> float:
+    """Return what counts of ``times``: CPU seconds on a CPU, of which others use some; wall seconds on a GPU."""
+    return times[1] if launch.get_device(device).is_cpu else times[0]
 
 
 def rmse(a: np.ndarray, b: np.ndarray | float = 0.0) -> float:

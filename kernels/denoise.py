@@ -237,6 +237,8 @@ def filter_neighbourhood(
                     away = wp.dot(face, guides.guide_position[j] - position)
                     turned = 1.0 - wp.dot(normal, guides.guide_normal[j])
                     e = squared * by_pixels + away * away * by_plane + turned * settings.normal_power
+                    if row == 0 and column == 0:
+                        e = float(0.0)  # the pixel itself, whatever rounding makes of its normal
                     if e < 12.0:
                         w = wp.exp(-e)
                         total += w

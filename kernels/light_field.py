@@ -19,6 +19,7 @@ SURFEL_EMITS = wp.constant(wp.uint32(0x8000))  # bit of a surfel whose texel is 
 PROBE_USABLE = wp.constant(0)
 PROBE_COVERED = wp.constant(1)  # inside of something: left out
 
+MOMENT_REACH = wp.constant(wp.float32(2.0))  # diagonals of a cage; moments count no distance as more
 WEIGHT_FLOOR = wp.constant(wp.float32(1.0e-3))
 COSINE_FLOOR = wp.constant(wp.float32(1.0e-3))
 SURFEL_TOLERANCE = wp.constant(wp.float32(8.0))  # texels; about 1.5 degrees at 256
@@ -262,10 +263,14 @@ def corner_weight(
     weight = (weight + WEIGHT_FLOOR) * wp.max(cosine, COSINE_FLOOR)
     biased = position + normal * field.bias - field.positions[probe]
     distance = wp.length(biased)
+    if distance < 1.0e-6:
+        return weight
     weight = weight * surfel_visibility(field, probe, biased, distance)
     if weight <= 0.0:
         return 0.0
-    return weight * chebyshev_visibility(probe_moments(field, probe, octahedral_encode(biased)), distance)
+    far = MOMENT_REACH * wp.length(field.spacing)
+    moments = probe_moments(field, probe, octahedral_encode(biased))
+    return weight * chebyshev_visibility(moments, wp.min(distance, far))
 
 
 # Irradiance [W/m^2] by light that surfaces reflect, at a point with a unit normal, from the eight probes around it.

@@ -38,6 +38,8 @@ LOBE_END = wp.constant(wp.float32(0.85))  # cosine below which its power, 3e-4, 
 SAME_DISTANCE = wp.constant(wp.float32(0.1))  # surfels that differ by less share their irradiance
 SAME_NORMAL = wp.constant(wp.float32(0.9))
 JITTER_DIMENSION = wp.constant(0)
+TEXEL_BACK = wp.constant(wp.uint8(1))  # sees the back of a triangle
+TEXEL_SAME = wp.constant(wp.uint8(2))  # sees the surfel that it saw before
 PROBE_FACTOR = wp.constant(wp.uint32(2654435769))
 
 
@@ -53,7 +55,7 @@ class ProbeWork:
     direct: wp.array(dtype=wp.uint32)  # RGB9E5, reflected direct light
     albedo: wp.array(dtype=wp.uint32)  # RGB9E5
     emission: wp.array(dtype=wp.uint32)  # RGB9E5; empty if no one asks for it
-    back: wp.array(dtype=wp.uint8)  # 1: sees the back of a triangle
+    back: wp.array(dtype=wp.uint8)  # TEXEL_*
     is_last: wp.int32  # 1: set the radiance of texels too, which no one reads before
     light_low: wp.int32  # texels along a side of the maps that irradiance is filtered from
     light_directions: wp.array(dtype=wp.vec4)  # [light_low^2] unit direction and solid angle [sr] of their texels
@@ -136,10 +138,13 @@ def trace_texels(first: wp.int32, scene: SceneData, field: LightField, work: Pro
             else:
                 surfel = pack_surfel(s.t, s.normal)
                 emission = surface_emission(scene, s.face, s.u, s.v, -direction)
-                side = wp.uint8(sees_back(scene, s.face, direction))
+                if sees_back(scene, s.face, direction) != 0:
+                    side = TEXEL_BACK
     if wp.max(emission) > 0.0:
         surfel = surfel | SURFEL_EMITS
     rays = wp.float32(work.rays)
+    if field.surfels[probe * size + texel] == surfel:
+        side = side | TEXEL_SAME
     field.surfels[probe * size + texel] = surfel
     work.back[item] = side
     if work.emission.shape[0] > 0:
@@ -209,7 +214,11 @@ def bounce(first: wp.int32, field: LightField, work: ProbeWork, side: wp.int32):
                 known = shared_irradiance(field, origin, texel, surfel, known)
                 radiance = radiance + wp.cw_mul(albedo, known.value) / wp.pi
             if work.is_last != 0:
-                field.radiance[probe * size + texel] = pack_radiance(radiance)
+                shown = radiance
+                if work.hysteresis > 0.0 and (work.back[slot * size + texel] & TEXEL_SAME) != wp.uint8(0):
+                    old = unpack_radiance(field.radiance[probe * size + texel])
+                    shown = old * work.hysteresis + radiance * (1.0 - work.hysteresis)
+                field.radiance[probe * size + texel] = pack_radiance(shown)
             total = total + radiance
     work.light[item] = total / wp.float32(scale * scale)
 

@@ -110,6 +110,7 @@ def check_miss(field: LightField, origin: wp.vec3, direction: wp.vec3, hit: Marc
     side = side_texel(hit.texel, field.resolution, o + direction * hit.t)
     word = field.surfels[map_start + side.texel]
     if surfel_distance(word) >= NOTHING:
+        hit.texel = side.texel  # which tells of the sky
         return hit
     n = surfel_normal(word)
     before = wp.dot(n, o - texel_direction(side.texel, field.resolution) * surfel_distance(word))

@@ -9,6 +9,7 @@ from warp_gi.kernels.bsdf import BsdfSample, average_fresnel, bsdf_sample, fresn
 from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, primary_direction, tiled_pixel
 from warp_gi.kernels.light_field import (
     NOTHING,
+    PROBE_USABLE,
     LightField,
     irradiance_at,
     surfel_distance,
@@ -17,6 +18,7 @@ from warp_gi.kernels.light_field import (
     unpack_radiance,
 )
 from warp_gi.kernels.light_field_march import MISS, march
+from warp_gi.kernels.octahedral import octahedral_encode, octahedral_texel
 from warp_gi.kernels.sampling import pixel_sample_index, pixel_seed, sample_1d, sample_2d
 from warp_gi.kernels.surface import Surface, ray_origin, surface_at
 from warp_gi.kernels.types import SceneData
@@ -35,6 +37,8 @@ DIRECTION_DIMENSION = wp.constant(41)
 class ProbeQuery:
     mode: wp.int32  # MODE_*
     rays: wp.int32  # of the current camera sample
+    first_ray: wp.int32  # of the current camera sample, among those of the pixel
+    ray_bits: wp.int32  # bits that count the rays of a pixel
 
 
 # Sums over samples, [height * width].
@@ -149,8 +153,8 @@ def trace_probes(
     share = wp.float32(settings.sample_count)  # samples that one evaluation stands for
     if rays > 0:
         share = share / wp.float32(rays)
-    seed = pixel_seed(p[0], p[1], settings.sample_bits, settings.seed)
-    first_index = pixel_sample_index(p[0], p[1], settings.first_sample, settings.sample_bits)
+    seed = pixel_seed(p[0], p[1], query.ray_bits, settings.seed)
+    first_index = pixel_sample_index(p[0], p[1], query.first_ray, query.ray_bits)
     diffuse = wp.vec3(0.0, 0.0, 0.0)
     glossy = wp.vec3(0.0, 0.0, 0.0)
     moment2 = wp.vec3(0.0, 0.0, 0.0)
@@ -164,13 +168,28 @@ def trace_probes(
         diffuse = diffuse + light.diffuse
         glossy = glossy + light.glossy
         moment2 = moment2 + wp.cw_mul(leaving, leaving)
+    count = wp.float32(settings.sample_count)
     total = (wp.cw_mul(s.bsdf.diffuse, diffuse) + glossy) * share
+    mean = total / count
     buffers.indirect[pixel] = buffers.indirect[pixel] + total
     buffers.moment1[pixel] = buffers.moment1[pixel] + total
-    buffers.moment2[pixel] = buffers.moment2[pixel] + moment2 * share
+    # the variance of the mean is taken for that of `sample_count` samples, and there were count / share
+    spread = moment2 * (share / count) - wp.cw_mul(mean, mean)
+    buffers.moment2[pixel] = buffers.moment2[pixel] + (wp.cw_mul(mean, mean) + spread * share) * count
     if buffers.diffuse.shape[0] > 0:
         buffers.diffuse[pixel] = buffers.diffuse[pixel] + diffuse * share
         buffers.glossy[pixel] = buffers.glossy[pixel] + glossy * share
+
+
+# What the sky sends against a direction, from the first probe that sees it there.
+@wp.func
+def sky_radiance(field: LightField, direction: wp.vec3) -> wp.vec3:
+    texel = octahedral_texel(octahedral_encode(direction), field.resolution)
+    size = field.resolution * field.resolution
+    for probe in range(field.states.shape[0]):
+        if field.states[probe] == PROBE_USABLE and surfel_distance(field.surfels[probe * size + texel]) >= NOTHING:
+            return unpack_radiance(field.radiance[probe * size + texel])
+    return wp.vec3(0.0, 0.0, 0.0)
 
 
 # Thread: a pixel. What the camera sees of the probes' surfels and of the sky behind them.
@@ -186,7 +205,9 @@ def view_probes(first: wp.int32, camera: CameraData, settings: PassSettings, fie
     depth = float(wp.inf)
     reflected = wp.vec3(0.0, 0.0, 0.0)
     emitted = wp.vec3(0.0, 0.0, 0.0)
-    if hit.probe >= 0:
+    if hit.probe < 0:
+        emitted = sky_radiance(field, direction)
+    else:
         texel = hit.probe * field.resolution * field.resolution + hit.texel
         surfel = field.surfels[texel]
         if hit.result != MISS:

@@ -102,7 +102,7 @@ BAD = [
         [*PROBES, "--cell-size=0.5"],
         "--cell-size is a setting of visibility-field, but light-field-probes is baked; leave it out, or give",
     ),
-    ([*PROBES, "--everywhere"], "probes are always baked for the whole scene: omit it"),
+    ([*PROBES, "--everywhere"], "a bake of probes is always of the whole grid: omit it"),
     ([*PROBES, "--export", "a.png"], "atlases of probes are .exr files; give NAME.exr"),
     ([*PROBES, "--primary", "probes"], "is a way to render; bake without it"),
     ([*PROBES, "--irradiance-resolution", "3"], "irradiance_resolution must be a whole number from 4 to 128, got 3"),

@@ -128,7 +128,7 @@ def parse(arguments: Sequence[str]) -> Render:
         name, equals, value = argument.partition("=")
         if name in chosen and (equals or index + 1 < len(arguments)):
             chosen[name] = value if equals else arguments[index + 1]
-        is_bake = is_bake or (argument.endswith(BAKE_SUFFIX) and not before.startswith("-"))
+        is_bake = is_bake or (argument.endswith(BAKE_SUFFIX) and before != "--bake")
         before = argument
     if not chosen["--pipeline"]:
         chosen["--pipeline"] = "probe_view" if is_bake else "path"
@@ -196,6 +196,8 @@ def run(options: Render, report: Reporter) -> None:
         report.line(f"{scene.name}: a bake, without its scene")
         if options.environment:
             raise OptionError("--environment goes with a scene; a bake shows the sky that it was baked under")
+        if options.environment_turn or options.smooth is not None or options.scale != 1.0:
+            raise OptionError("--environment-turn, --smooth and --scale go with a scene; a bake shows what was baked")
     else:
         report.line(f"{scene.name}: {scene.triangle_count:,} triangles, {scene.emitter_count:,} emitters")
     shots = plan(options, camera)
@@ -215,8 +217,8 @@ def run(options: Render, report: Reporter) -> None:
             turn_sky(options, scene, sky, shot.index)  # what the frame's file has to say
         if not options.resume or not is_done(options, shot, scheduler, report):
             todo.append(shot)
-    if todo and len(todo) < len(shots) and options.settings.denoise is not None and options.settings.denoise.remembers:
-        report.line("every frame is rendered again: the denoiser goes by the frames before")
+    if todo and len(todo) < len(shots) and (reason := what_remembers(options, scene)):
+        report.line(f"every frame is rendered again: {reason} by the frames before")
         todo = shots
     if todo:
         check_writable(options.output.parent)
@@ -310,6 +312,18 @@ def turn_sky(options: Render, scene: Scene, sky: Environment | None, index: int)
         turned = sky.rotated(math.fmod(index * options.environment_turn, 360.0))
         if scene.environment is None or turned.rotation != scene.environment.rotation:
             scene.environment = turned
+
+
+def what_remembers(options: Render, scene: Scene | BakedScene) -> str:
+    """Return what makes a frame depend on those before it, or nothing."""
+    settings = options.settings
+    if settings.denoise is not None and settings.denoise.remembers:
+        return "the denoiser goes"
+    if scene.is_animated or options.environment_turn:
+        for term, estimator in settings.estimators():
+            if estimator.remembers:
+                return f"the {term} light follows what changes"
+    return ""
 
 
 def is_done(options: Render, shot: Shot, scheduler: FrameScheduler, report: Reporter) -> bool:

@@ -105,7 +105,7 @@ def _summary_of_field(bake: Bake, seconds: float) -> Rows:
 def _check_probes(settings: LightFieldProbes, everywhere: bool) -> None:
     if everywhere:
         raise OptionError(
-            "--everywhere goes with visibility fields; probes are always baked for the whole scene: omit it"
+            "--everywhere goes with visibility fields; a bake of probes is always of the whole grid: omit it"
         )
     if settings.primary == "probes":
         raise OptionError(
@@ -114,8 +114,8 @@ def _check_probes(settings: LightFieldProbes, everywhere: bool) -> None:
 
 
 def _check_grid(settings: LightFieldProbes, scene: Scene) -> None:
-    if all(settings.counts):  # else the grid follows from where there is free space, which is for the bake to find out
-        probe_grid(scene.bounds, settings.counts, settings.spacing, settings.resolution)
+    if all(settings.counts):  # else the grid follows from where light reaches, which is for the bake to find out
+        probe_grid(scene.bounds, settings.counts, settings.spacing, settings.largest_map)
 
 
 def map_bytes(bake: Bake) -> int:

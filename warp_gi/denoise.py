@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 from dataclasses import dataclass
+from numbers import Integral
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -113,6 +114,9 @@ class SpatioTemporal(Denoiser):
         for kind in ("diffuse", "glossy"):
             radius, stride = getattr(self, f"{kind}_radius"), getattr(self, f"{kind}_stride")
             hysteresis = getattr(self, f"{kind}_hysteresis")
+            for name, value in (("radius", radius), ("stride", stride)):
+                if isinstance(value, bool) or not isinstance(value, Integral):
+                    raise OptionError(f"{kind}_{name} must be a whole number of pixels, got {value!r}")
             if not 0 <= radius <= MOST_RADIUS:
                 raise OptionError(f"{kind}_radius must be from 0 to {MOST_RADIUS} pixels, got {radius}")
             if stride < 1:

@@ -31,6 +31,11 @@ class Estimator:
         """Whether the estimator finds out what the camera sees, too: then it is the only one of its pipeline."""
         return False
 
+    @property
+    def remembers(self) -> bool:
+        """Whether frames depend on those before, if the scene or its sky changes."""
+        return False
+
     def __post_init__(self) -> None:
         self.validate()
 

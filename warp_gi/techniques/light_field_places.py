@@ -101,6 +101,8 @@ def lit_bounds(scene: Any, device: wp.Device) -> np.ndarray:
     if typical <= 0:
         return bounds
     useful = _is_lit(light, typical) | _seen_by_cameras(scene, points, device)
+    if not useful.any():
+        return bounds
     useful = useful.reshape(SLABS, SLABS, SLABS)
     box = bounds.copy()
     for axis in range(3):

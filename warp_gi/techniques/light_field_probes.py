@@ -17,7 +17,7 @@ from warp_gi.estimator import Estimator
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_trace as trace_kernels
 from warp_gi.techniques.light_field_places import lit_data
-from warp_gi.techniques.light_field_state import ProbeState
+from warp_gi.techniques.light_field_state import ProbeState, sky_bytes
 
 _MODES = {
     "irradiance": trace_kernels.MODE_IRRADIANCE,
@@ -110,15 +110,17 @@ class LightFieldProbes(Estimator):
     # ---- bake ----
 
     def bake_key(self, scene: Any) -> str:
-        """Return the hash of geometry, materials and lights. A changed sky needs no new bake: probes adapt to it."""
+        """Return the hash of geometry, materials and lights. A changed sky needs no new bake: probes adapt to it.
+
+        They do so in some frames if it changes while frames are rendered, before the first one else.
+        """
         return scene.contents_hash
 
     def bake_settings(self, scene: Any) -> dict[str, Any]:
-        """Return the settings that decide the maps, and the sky."""
+        """Return the settings that decide the maps."""
         names = ("spacing", "resolution", "irradiance_resolution", "rays", "bounces", "tolerance", "relocate")
-        sky = "none" if scene.environment is None else scene.environment.content_hash[:16]
         counts = "x".join(str(int(n)) for n in self.counts)
-        return {"counts": counts, "sky": sky, "weights": self.weights, **{name: getattr(self, name) for name in names}}
+        return {"counts": counts, "weights": self.weights, **{name: getattr(self, name) for name in names}}
 
     def bake(
         self,
@@ -136,8 +138,12 @@ class LightFieldProbes(Estimator):
         return state.to_bake(scene)
 
     def start(self, scene: Any, device: str, bake: Bake | None, seed: int = 0) -> ProbeState:
-        """Return the state of probes that hold a bake."""
-        state = ProbeState(scene, launch.get_device(device), self, seed, bake)
+        """Return the state of probes that hold a bake; under another sky than its own they are filled again."""
+        target = launch.get_device(device)
+        state = ProbeState(scene, target, self, seed, bake)
+        if scene.triangle_count and not np.array_equal(bake.arrays["sky"], sky_bytes(scene)):
+            scene.update(0.0, None, target)
+            state.fill(scene)
         state.key = _key(scene, 0.0)
         return state
 
@@ -148,11 +154,20 @@ class LightFieldProbes(Estimator):
         """
         if bake.technique != "LightFieldProbes":
             raise BakeError(f"expected a bake of LightFieldProbes, got one of {bake.technique}")
-        settings = {name: value for name, value in bake.settings.items() if name != "sky"}
-        counts = tuple(int(count) for count in settings["counts"].split("x"))
-        return replace(self, **{**settings, "counts": counts})
+        counts = tuple(int(count) for count in bake.settings["counts"].split("x"))
+        return replace(self, **{**bake.settings, "counts": counts})
 
     # ---- frames ----
+
+    @property
+    def remembers(self) -> bool:
+        """Whether frames depend on those before, if the scene or its sky changes."""
+        return self.update > 0
+
+    @property
+    def largest_map(self) -> int:
+        """Texels along a side of the largest map of a probe."""
+        return max(self.resolution, self.irradiance_resolution)
 
     @property
     def makes_primary(self) -> bool:
@@ -181,7 +196,11 @@ class LightFieldProbes(Estimator):
         settings = frame.pass_settings
         query = trace_kernels.ProbeQuery()
         query.mode = _MODES[self.mode]
-        query.rays = -(-self.pixel_rays // settings.camera_samples) or settings.sample_count
+        query.rays, query.first_ray, query.ray_bits = settings.sample_count, settings.first_sample, settings.sample_bits
+        if self.pixel_rays:
+            query.rays = -(-self.pixel_rays // settings.camera_samples)
+            query.first_ray = settings.camera_sample * query.rays
+            query.ray_bits = (query.rays * settings.camera_samples - 1).bit_length()
         buffers = trace_kernels.ProbeBuffers()
         buffers.indirect = frame["indirect"]
         buffers.moment1, buffers.moment2 = frame.moments("indirect")

@@ -53,7 +53,7 @@ class ProbeState:
         self.device, self.settings, self.seed = device, settings, seed
         if bake is None:
             box = lit_bounds(scene, device)
-            self.grid = probe_grid(box, settings.counts, settings.spacing, settings.resolution)
+            self.grid = probe_grid(box, settings.counts, settings.spacing, settings.largest_map)
             bounds = scene.bounds
         else:
             arrays = bake.arrays
@@ -102,11 +102,15 @@ class ProbeState:
     # ---- filling ----
 
     def bake(self, scene: Any, progress: Callable[[float], None] | None = None) -> None:
-        """Place all probes, trace them, and let light bounce between them until it changes no more."""
+        """Place all probes, and fill them."""
+        if self.settings.relocate:
+            relocate(scene, lit_data(scene, self.device), self.grid, self.field, self.device)
+        self.fill(scene, progress)
+
+    def fill(self, scene: Any, progress: Callable[[float], None] | None = None) -> None:
+        """Trace all probes where they stand, and let light bounce between them until it changes no more."""
         settings, told = self.settings, progress or (lambda share: None)
         data = lit_data(scene, self.device)
-        if settings.relocate:
-            relocate(scene, data, self.grid, self.field, self.device)
         every = np.arange(self.grid.probe_count)
         work = self._work(every, settings.rays, scene, with_emission=scene.emitter_count > 0)
         self._trace(data, work, every, lambda share: told(0.8 * share))
@@ -127,10 +131,12 @@ class ProbeState:
 
     def refresh(self, scene: Any, data: Any, probes: np.ndarray) -> None:
         """Trace some probes again, and blend what they gather into their irradiance."""
-        work = self._work(probes, 1, scene, with_emission=False)
+        work = self._work(probes, 1, scene, with_emission=scene.emitter_count > 0)
         self._trace(data, work, probes)
+        self._find_covered(work)
         work.hysteresis = self.settings.hysteresis
         self._bounce(work, len(probes), is_last=True)
+        self._keep_emission(work)
         self.refreshes += 1
 
     def take_stale(self, most: int) -> np.ndarray:
@@ -152,7 +158,7 @@ class ProbeState:
         work.rays = rays
         work.seed = (self.seed * 0x9E3779B1 + self.refreshes * 0x85EBCA77 + 1) & 0xFFFFFFFF
         work.sky_probability = sky_probability(scene)
-        work.radius = 2.0 * float(np.linalg.norm(self.grid.spacing))
+        work.radius = float(field_kernels.MOMENT_REACH) * float(np.linalg.norm(self.grid.spacing))
         for name in ("direct", "albedo"):
             setattr(work, name, wp.empty(count * texels, dtype=wp.uint32, device=self.device))
         work.emission = wp.empty(count * texels * with_emission, dtype=wp.uint32, device=self.device)
@@ -192,21 +198,30 @@ class ProbeState:
 
     def _find_covered(self, work: Any) -> None:
         """Leave out probes that mostly see back faces, unless all do: then it is the faces that are the wrong way."""
-        back = work.back.numpy().reshape(self.grid.probe_count, -1).mean(axis=1)
-        covered = back > COVERED_SHARE
-        if covered.all():
-            covered[:] = False
-        states = np.where(covered, int(field_kernels.PROBE_COVERED), int(field_kernels.PROBE_USABLE))
-        self.field.states = self._array(states.astype(np.int32), wp.int32)
+        probes = work.probes.numpy()
+        back = (work.back.numpy() & int(bake_kernels.TEXEL_BACK)).reshape(len(probes), -1).mean(axis=1)
+        states = self.field.states.numpy()
+        states[probes] = np.where(
+            back > COVERED_SHARE, int(field_kernels.PROBE_COVERED), int(field_kernels.PROBE_USABLE)
+        )
+        if (states == int(field_kernels.PROBE_COVERED)).all():
+            states[:] = int(field_kernels.PROBE_USABLE)
+        self.field.states = self._array(states, wp.int32)
 
     def _keep_emission(self, work: Any) -> None:
         """Keep the radiance of texels that see an emitter, by their index."""
         if work.emission.shape[0] == 0:
             return
-        emission = work.emission.numpy()
-        texels = np.flatnonzero(emission).astype(np.int32)
-        self.field.emission_texels = self._array(texels, wp.int32)
-        self.field.emission = self._array(emission[texels], wp.uint32)
+        probes, size = work.probes.numpy(), self.settings.resolution**2
+        found = work.emission.numpy()
+        slots = np.flatnonzero(found)
+        texels, emission = self.field.emission_texels.numpy(), self.field.emission.numpy()
+        kept = ~np.isin(texels // size, probes)
+        texels = np.concatenate([texels[kept], probes[slots // size].astype(np.int32) * size + slots % size])
+        emission = np.concatenate([emission[kept], found[slots]])
+        order = np.argsort(texels)
+        self.field.emission_texels = self._array(texels[order].astype(np.int32), wp.int32)
+        self.field.emission = self._array(emission[order], wp.uint32)
 
     # ---- bakes ----
 
@@ -220,6 +235,7 @@ class ProbeState:
             "grid_spacing": self.grid.spacing,
             "grid_counts": np.array(self.grid.counts, np.int32),
             "bounds": scene.bounds,
+            "sky": sky_bytes(scene),
         }
         counts = {
             "probes": self.grid.probe_count,
@@ -249,6 +265,13 @@ class ProbeState:
         field = self.field
         arrays = (field.radiance, field.surfels, field.nearest, field.irradiance, field.moments, field.emission)
         return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays)
+
+
+def sky_bytes(scene: Any) -> np.ndarray:
+    """Return the hash of the scene's sky, uint8; of zeros if there is none."""
+    if scene.environment is None:
+        return np.zeros(32, np.uint8)
+    return np.frombuffer(bytes.fromhex(scene.environment.content_hash), np.uint8)
 
 
 def _part(work: Any, start: int, stop: int, texels: int) -> Any:
