@@ -144,18 +144,16 @@ def mode_rows(place: Place, view: View, grids: list[dict[str, Any]], repetitions
         for mode, stage in stages.items():
             if mode == "paths":
                 continue
-            wall, cpu = times[mode]
+            (wall, cpu), seconds = times[mode], cost(times[mode], view.device)
             quality = view.quality(stage.picture)
             needed = max(noise / max(quality["RMSE"] ** 2, 1e-30), 1.0)
             row: Row = {"table": "indirect light", "case": place.name, "probes": _counts(stage), "mode": mode}
             row |= {"spp": stage.spp} | quality
-            row |= {
-                "ns a pixel": cost(times[mode], view.device) / np.prod(view.camera.resolution) * 1e9,
-                "wall s": wall,
-            }
+            row |= {"ns a pixel": seconds / np.prod(view.camera.resolution) * 1e9, "wall s": wall}
             row |= {"paths spp for this RMSE": needed, "faster, wall": needed * each[0] / wall}
             row |= {"faster, cpu": needed * each[1] / cpu, "target": place.target if mode == "irradiance" else 0.0}
-            rows.append(row | {"paths RMSE in this time": float((noise / max(cpu / each[1], 1.0)) ** 0.5)})
+            samples = max(seconds / cost(each, view.device), 1.0)
+            rows.append(row | {"paths RMSE in this time": float((noise / samples) ** 0.5)})
     return rows
 
 

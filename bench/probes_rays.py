@@ -51,12 +51,8 @@ def place_rows(place: Place, view: View, quick: bool, count: int = RAYS) -> list
 def surface_rays(view: View, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return float32 [ray, 3] origins, just off a surface, and unit directions; fewer than asked if many get lost."""
     rng = np.random.default_rng(seed)
-    camera, (width, height) = view.camera, view.camera.resolution
-    scale = 2 * np.tan(np.radians(camera.hfov) / 2) / width
-    at = rng.uniform(size=(count, 2)) * (width, height) - np.array([width, height]) / 2
-    local = np.stack([at[:, 0] * scale, -at[:, 1] * scale, np.full(count, -1.0)], axis=1)
-    ways = local @ camera.world_from_camera[:3, :3].T
-    rays = np.broadcast_to(camera.position, (count, 3)), ways / np.linalg.norm(ways, axis=1, keepdims=True)
+    ways = view.camera.directions(rng.uniform(size=(count, 2)) * view.camera.resolution)
+    rays = np.broadcast_to(view.camera.position, ways.shape), ways
     parts = []
     for _ in range(2):
         rays = bounced(view, *rays, rng)

@@ -12,11 +12,11 @@ import numpy as np
 import warp_gi as gi
 from warp_gi.bench import presets
 from warp_gi.bench.stages import Place, Row, Stage, Times, timed_bake
+from warp_gi.metrics import RELATIVE_EPSILON
 
 MAX_DEPTH = 16
 """Of the path tracer that is the truth; probes let light bounce until it changes no more."""
 SEED = 7
-RELATIVE_EPSILON = 0.01
 
 
 def _cornell() -> gi.Scene:

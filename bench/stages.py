@@ -63,7 +63,7 @@ class Stage:
     def trace(self) -> None:
         """Do the stage once more; its sums are no picture any more."""
         self.estimator.trace(self.frame, self.state)
-        if isinstance(self.estimator, gi.BsdfPaths):
+        if self.frame.wants_paths:
             self.frame.launch_paths()
         wp.synchronize_device(self.frame.device)
 

@@ -24,7 +24,7 @@ from warp_gi.kernels.light_field import (
     texel_direction,
     unpack_radiance,
 )
-from warp_gi.kernels.light_field_place import sees_back
+from warp_gi.kernels.light_field_place import PROBE_FACTOR, sees_back
 from warp_gi.kernels.octahedral import octahedral_decode, octahedral_wrap
 from warp_gi.kernels.path_trace import TERM_EMITTERS, TERM_ENVIRONMENT, PathSettings, trace_path
 from warp_gi.kernels.sampling import hash_uint, morton_code, sample_2d
@@ -40,7 +40,6 @@ SAME_NORMAL = wp.constant(wp.float32(0.9))
 JITTER_DIMENSION = wp.constant(0)
 TEXEL_BACK = wp.constant(wp.uint8(1))  # sees the back of a triangle
 TEXEL_SAME = wp.constant(wp.uint8(2))  # sees the surfel that it saw before
-PROBE_FACTOR = wp.constant(wp.uint32(2654435769))
 
 
 # What is known of the texels of some probes only while they are filled, [slot * resolution^2].

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_gi.kernels.bvh import bvh_intersect, bvh_occluded
+from warp_gi.kernels.bvh import bvh_intersect
 from warp_gi.kernels.environment import environment_radiance
 from warp_gi.kernels.light_field import LightField
 from warp_gi.kernels.path_trace import TERM_EMITTERS, TERM_ENVIRONMENT, TERM_INDIRECT, PathSettings, trace_path
@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 PLACE_STEPS = wp.constant(6)
 PLACE_BACK = wp.constant(wp.float32(0.25))  # share of back faces from which a probe looks for a way out
 LIGHT_DEPTH = wp.constant(6)  # edges of the longest path that says where light is
-POINT_FACTOR = wp.constant(wp.uint32(2654435769))
+PROBE_FACTOR = wp.constant(wp.uint32(2654435769))
 
 
 # 1 where a ray meets the back of a triangle.
@@ -94,30 +94,11 @@ def measure_light(
     paths.roulette_depth = LIGHT_DEPTH
     paths.sky_probability = sky_probability
     s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
-    seed = hash_uint(wp.uint32(point) * POINT_FACTOR)
+    seed = hash_uint(wp.uint32(point) * PROBE_FACTOR)
     path = trace_path(scene, s, -direction, paths, wp.uint32(i - point * directions), seed)
     total = path.environment + path.emitters + path.indirect
     total = total + surface_emission(scene, hit.face, hit.u, hit.v, -direction)
     light[i] = (total[0] + total[1] + total[2]) / 3.0
-
-
-# Thread: a point. Sets whether any of some eyes sees it, 0 or 1.
-@wp.kernel
-def find_seen(
-    first: wp.int32,
-    scene: SceneData,
-    eyes: wp.array(dtype=wp.vec3),
-    points: wp.array(dtype=wp.vec3),
-    seen: wp.array(dtype=wp.int32),
-):
-    i = first + wp.tid()
-    result = int(0)
-    for eye in range(eyes.shape[0]):
-        way = points[i] - eyes[eye]
-        if not bvh_occluded(scene.bvh, eyes[eye], way, 1.0):
-            result = int(1)
-            break
-    seen[i] = result
 
 
 # Thread: a probe. Moves it out of what it is inside of, or away from a wall that is too near, by at most `most` along

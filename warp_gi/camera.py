@@ -88,6 +88,14 @@ class Camera:
         """The eye, float64 [3], metres."""
         return self.world_from_camera[:3, 3]
 
+    def directions(self, pixels: np.ndarray) -> np.ndarray:
+        """Return unit vectors float64 [n, 3] from the camera through pixel coordinates [n, 2], as of ``project``."""
+        width, height = self.resolution
+        scale = 2 * math.tan(math.radians(self.hfov) / 2) / width
+        x, y = np.moveaxis((np.asarray(pixels, dtype=np.float64) - (0.5 * width, 0.5 * height)) * scale, -1, 0)
+        ways = np.stack([x, -y, np.full_like(x, -1.0)], axis=-1) @ self.world_from_camera[:3, :3].T
+        return ways / np.linalg.norm(ways, axis=-1, keepdims=True)
+
     def project(self, points: np.ndarray) -> np.ndarray:
         """Return pixel coordinates float64 [n, 2] of world ``points`` [n, 3]; (0, 0) is the top left corner."""
         local = (np.asarray(points, dtype=np.float64) - self.position) @ self.world_from_camera[:3, :3]

@@ -20,6 +20,16 @@ def flag(metavar: str, default: str, *aliases: str) -> object:
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})", aliases=aliases)
 
 
+def value_given(arguments: Sequence[str], name: str) -> str | None:
+    """Return the value of the flag ``name``, the last one if there are several; None if there is none."""
+    value = None
+    for argument, after in zip(arguments, [*arguments[1:], None], strict=True):
+        flag_name, equals, own = argument.partition("=")
+        if flag_name == name:
+            value = own if equals else after
+    return value
+
+
 def parse_options(options: type[Options], command: str, arguments: Sequence[str], **settings: Any) -> Options:
     """Return ``options`` filled from the command line; ``settings`` go to ``tyro.cli``.
 

@@ -19,7 +19,7 @@ from warp_gi import launch
 from warp_gi.baking import load_bake
 from warp_gi.camera import Camera, CameraPath
 from warp_gi.cli_inputs import DEFAULT_SCENE, SceneOptions, find_camera, find_scene, parse_resolution
-from warp_gi.cli_options import flag, parse_options
+from warp_gi.cli_options import flag, parse_options, value_given
 from warp_gi.cli_report import Reporter, start_warp
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.files import check_writable, remove_stale_parts
@@ -121,20 +121,11 @@ def main(arguments: Sequence[str]) -> int:
 
 def parse(arguments: Sequence[str]) -> Render:
     """Return the options; the pipeline named among them decides which settings there are."""
-    chosen = {"--pipeline": "", "--denoise": ""}
-    before = ""
-    is_bake = False
-    for index, argument in enumerate(arguments):
-        name, equals, value = argument.partition("=")
-        if name in chosen and (equals or index + 1 < len(arguments)):
-            chosen[name] = value if equals else arguments[index + 1]
-        is_bake = is_bake or (argument.endswith(BAKE_SUFFIX) and before != "--bake")
-        before = argument
-    if not chosen["--pipeline"]:
-        chosen["--pipeline"] = "probe_view" if is_bake else "path"
-    settings = pipeline_named(chosen["--pipeline"])
-    if chosen["--denoise"]:
-        settings = replace(settings, denoise=_denoiser(chosen["--denoise"]))
+    before = ["", *arguments]
+    is_bake = any(a.endswith(BAKE_SUFFIX) and b != "--bake" for a, b in zip(arguments, before, strict=False))
+    settings = pipeline_named(value_given(arguments, "--pipeline") or ("probe_view" if is_bake else "path"))
+    if denoiser := value_given(arguments, "--denoise"):
+        settings = replace(settings, denoise=_denoiser(denoiser))
     default = Render(settings=settings)
     options = parse_options(
         Render,

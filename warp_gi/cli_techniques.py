@@ -9,13 +9,14 @@ from typing import Any
 
 from warp_gi.baking import Bake
 from warp_gi.camera import Camera
+from warp_gi.cli_options import value_given
 from warp_gi.cli_report import Reporter
 from warp_gi.errors import OptionError, unknown_name
-from warp_gi.kernels import light_field as field_kernels
 from warp_gi.scene.scene import Scene
 from warp_gi.techniques import light_field_export, light_field_pictures, visibility_export
 from warp_gi.techniques.light_field_places import probe_grid
 from warp_gi.techniques.light_field_probes import LightFieldProbes
+from warp_gi.techniques.light_field_state import bounce_changes
 from warp_gi.techniques.visibility_field import VisibilityField
 
 Rows = list[tuple[str, Any]]
@@ -57,13 +58,10 @@ def technique_of(arguments: Sequence[str]) -> str:
 
     Raises OptionError for an unknown one, and for a flag that is a setting of another one only.
     """
-    chosen = DEFAULT_TECHNIQUE
-    for index, argument in enumerate(arguments):
-        flag, equals, value = argument.partition("=")
-        if flag == "--technique" and (equals or index + 1 < len(arguments)):
-            chosen = value if equals else arguments[index + 1]
-            if chosen not in TECHNIQUES:
-                raise unknown_name("technique", chosen, TECHNIQUES)
+    given = value_given(arguments, "--technique")
+    chosen = DEFAULT_TECHNIQUE if given is None else given
+    if chosen not in TECHNIQUES:
+        raise unknown_name("technique", chosen, TECHNIQUES)
     names = {name: {field.name for field in fields(one.settings)} for name, one in TECHNIQUES.items()}
     for argument in arguments:
         flag = argument.partition("=")[0]
@@ -118,19 +116,6 @@ def _check_grid(settings: LightFieldProbes, scene: Scene) -> None:
         probe_grid(scene.bounds, settings.counts, settings.spacing, settings.largest_map)
 
 
-def map_bytes(bake: Bake) -> int:
-    """Return the bytes of all maps of a bake of light field probes on the device, as ``ProbeState.nbytes``."""
-    names = ("radiance", "surfels", "irradiance", "moments", "emission")
-    blocks = int(bake.counts["probes"]) * (int(bake.settings["resolution"]) // int(field_kernels.BLOCK)) ** 2
-    return sum(bake.arrays[name].nbytes for name in names) + 4 * blocks  # and the least distance in each block
-
-
-def bounce_changes(bake: Bake) -> list[float]:
-    """Return by how much each bounce changed the irradiance of probes, as a share of it; the first is 1."""
-    count = sum(name.startswith("change_") for name in bake.counts)
-    return [float(bake.counts[f"change_{number + 1}"]) for number in range(count)]
-
-
 def _summary_of_probes(bake: Bake, seconds: float) -> Rows:
     counts, settings, changes = bake.counts, bake.settings, bounce_changes(bake)
     size, few = int(settings["resolution"]), int(settings["irradiance_resolution"])
@@ -148,7 +133,7 @@ def _summary_of_probes(bake: Bake, seconds: float) -> Rows:
         ("million rays a second", counts["rays"] / 1e6 / max(seconds, 1e-9)),
         ("bounces", len(changes)),
         ("change of the last", changes[-1]),
-        ("maps in memory [MB]", map_bytes(bake) / 1e6),
+        ("maps in memory [MB]", counts["bytes"] / 1e6),
     ]
 
 

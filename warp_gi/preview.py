@@ -8,6 +8,7 @@ about where it is. Exposure is in stops and fixed: previews of a sequence do not
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,14 @@ def magma(values: np.ndarray) -> np.ndarray:
 
     source = oiio.ImageBuf(np.ascontiguousarray(np.clip(values, 0, 1), np.float32)[:, :, None])
     return to_bytes(oiio.ImageBufAlgo.color_map(source, 0, "magma").get_pixels(oiio.FLOAT)[:, :, :3])
+
+
+def write_pngs(folder: str | Path, pictures: Mapping[str, np.ndarray]) -> list[Path]:
+    """Write uint8 [height, width, 3] images as NAME.png to a folder, and return the paths."""
+    paths = [Path(folder) / f"{name}.png" for name in pictures]
+    for path, pixels in zip(paths, pictures.values(), strict=True):
+        write_png(path, np.ascontiguousarray(pixels))
+    return paths
 
 
 def write_png(path: str | Path, pixels: np.ndarray) -> None:

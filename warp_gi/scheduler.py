@@ -121,6 +121,11 @@ class Frame:
         if paths is not None:
             self._paths = paths
 
+    @property
+    def wants_paths(self) -> bool:
+        """Whether an estimator asked for a term of the path-tracing launch."""
+        return self._path_terms != 0
+
     def launch_paths(self) -> None:
         """Trace the terms that were asked for since the camera sample began, in one launch."""
         paths = path_trace.PathSettings()

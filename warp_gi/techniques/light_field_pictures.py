@@ -14,7 +14,7 @@ from warp_gi.camera import Camera
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_march as march_kernels
 from warp_gi.pipeline import Pipeline
-from warp_gi.preview import magma, tone_map, write_png
+from warp_gi.preview import magma, tone_map, write_pngs
 from warp_gi.scene.scene import Scene
 from warp_gi.scheduler import Frame, FrameScheduler
 from warp_gi.techniques.legends import exposure_of, label_font, scale_bar, stacked, with_keys
@@ -69,11 +69,7 @@ def write_pictures(
     origin, direction = _telling_ray(frame, state)
     pictures = _sheets(bake, exposure)
     pictures |= {"places": draw_places(frame, state), "ray": draw_ray(state, origin, direction, exposure)}
-    paths = []
-    for name, pixels in pictures.items():
-        paths.append(Path(folder) / f"{name}.png")
-        write_png(paths[-1], np.ascontiguousarray(pixels))
-    return paths
+    return write_pngs(folder, pictures)
 
 
 # ---- all maps ----
@@ -211,10 +207,8 @@ def draw_places(frame: Frame, state: Any) -> np.ndarray:
 
 def _reflected_ray(frame: Frame, column: int, row: int) -> tuple[np.ndarray, np.ndarray]:
     """Return origin [m] and unit direction, float64 [3], of a pixel's ray, mirrored where it hits if it does."""
-    camera, (width, height) = frame.camera, frame.camera.resolution
-    scale = 2 * math.tan(math.radians(camera.hfov) / 2) / width
-    local = np.array([(column + 0.5 - width / 2) * scale, (height / 2 - row - 0.5) * scale, -1.0])
-    direction = camera.world_from_camera[:3, :3] @ local / np.linalg.norm(local)
+    camera = frame.camera
+    (direction,) = camera.directions([(column + 0.5, row + 0.5)])
     normal = frame.numpy("normal")[row, column].astype(np.float64)
     length = np.linalg.norm(normal)  # below 1 where samples of a pixel differ
     if length == 0 or not np.isfinite(frame.numpy("depth")[row, column]):

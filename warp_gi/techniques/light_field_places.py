@@ -139,13 +139,12 @@ def _is_lit(light: np.ndarray, typical: float) -> np.ndarray:
 
 def _seen_by_cameras(scene: Any, points: np.ndarray, device: wp.Device) -> np.ndarray:
     """Return bool [point]: whether there is nothing between it and one of the scene's cameras."""
-    eyes = [camera.position for camera in scene.cameras.values()]
-    if not eyes:
-        return np.zeros(len(points), bool)
-    seen = wp.empty(len(points), dtype=wp.int32, device=device)
-    arrays = [wp.array(np.asarray(v, np.float32), dtype=wp.vec3, device=device) for v in (eyes, points)]
-    launch.launch(kernels.find_seen, len(points), [scene.data(device), *arrays, seen], device)
-    return seen.numpy() != 0
+    seen = np.zeros(len(points), bool)
+    for camera in scene.cameras.values():
+        origins = np.broadcast_to(camera.position, points.shape).astype(np.float32)
+        ways = points.astype(np.float32) - origins
+        seen |= scene.bvh(device).occluded(origins, ways, t_max=1.0).numpy() == 0
+    return seen
 
 
 def relocate(scene: Any, data: types.SceneData, grid: ProbeGrid, field: Any, device: wp.Device) -> None:

@@ -143,7 +143,7 @@ class LightFieldProbes(Estimator):
         state = ProbeState(scene, target, self, seed, bake)
         if scene.triangle_count and not np.array_equal(bake.arrays["sky"], sky_bytes(scene)):
             scene.update(0.0, None, target)
-            state.fill(scene)
+            state.fill(scene, lit_data(scene, target))
         state.key = _key(scene, 0.0)
         return state
 

@@ -13,6 +13,7 @@ from warp_gi import launch
 from warp_gi.baking import Bake
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_bake as bake_kernels
+from warp_gi.kernels import types
 from warp_gi.techniques.baselines import sky_probability
 from warp_gi.techniques.light_field_places import ProbeGrid, lit_bounds, lit_data, probe_grid, relocate
 
@@ -103,14 +104,14 @@ class ProbeState:
 
     def bake(self, scene: Any, progress: Callable[[float], None] | None = None) -> None:
         """Place all probes, and fill them."""
+        data = lit_data(scene, self.device)
         if self.settings.relocate:
-            relocate(scene, lit_data(scene, self.device), self.grid, self.field, self.device)
-        self.fill(scene, progress)
+            relocate(scene, data, self.grid, self.field, self.device)
+        self.fill(scene, data, progress)
 
-    def fill(self, scene: Any, progress: Callable[[float], None] | None = None) -> None:
+    def fill(self, scene: Any, data: types.SceneData, progress: Callable[[float], None] | None = None) -> None:
         """Trace all probes where they stand, and let light bounce between them until it changes no more."""
         settings, told = self.settings, progress or (lambda share: None)
-        data = lit_data(scene, self.device)
         every = np.arange(self.grid.probe_count)
         work = self._work(every, settings.rays, scene, with_emission=scene.emitter_count > 0)
         self._trace(data, work, every, lambda share: told(0.8 * share))
@@ -241,6 +242,7 @@ class ProbeState:
             "probes": self.grid.probe_count,
             "covered": int((arrays["states"] != 0).sum()),
             "rays": self.grid.probe_count * settings.resolution**2 * settings.rays,
+            "bytes": self.nbytes,
             **{f"change_{number + 1}": change for number, change in enumerate(self.changes)},
         }
         return Bake("LightFieldProbes", scene.contents_hash, settings.bake_settings(scene), arrays, counts, scene.name)
@@ -252,8 +254,7 @@ class ProbeState:
         dtypes |= {"emission_texels": wp.int32, "radiance": wp.uint32, "surfels": wp.uint32, "emission": wp.uint32}
         for name, dtype in dtypes.items():
             setattr(field, name, self._array(bake.arrays[name], dtype))
-        passes = sum(name.startswith("change_") for name in bake.counts)
-        self.changes = [float(bake.counts[f"change_{number + 1}"]) for number in range(passes)]
+        self.changes = bounce_changes(bake)
         work = bake_kernels.ProbeWork()
         work.probes = self._array(np.arange(self.grid.probe_count, dtype=np.int32), wp.int32)
         blocks = (self.settings.resolution // int(field_kernels.BLOCK)) ** 2
@@ -265,6 +266,12 @@ class ProbeState:
         field = self.field
         arrays = (field.radiance, field.surfels, field.nearest, field.irradiance, field.moments, field.emission)
         return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays)
+
+
+def bounce_changes(bake: Bake) -> list[float]:
+    """Return by how much each bounce changed the irradiance of probes, as a share of it; the first is 1."""
+    count = sum(name.startswith("change_") for name in bake.counts)
+    return [float(bake.counts[f"change_{number + 1}"]) for number in range(count)]
 
 
 def sky_bytes(scene: Any) -> np.ndarray:

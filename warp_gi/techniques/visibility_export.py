@@ -22,7 +22,7 @@ from warp_gi.files import replacing
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_audit as audit_kernels
 from warp_gi.pipeline import Pipeline
-from warp_gi.preview import tone_map, write_png
+from warp_gi.preview import tone_map, write_pngs
 from warp_gi.scene.scene import Scene
 from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence import frame_path
@@ -211,7 +211,6 @@ def write_pictures(
         device: Where to render.
         seed: Of the rays.
     """
-    folder = Path(folder)
     fields = {"mode": settings.mode, "budget": 0.0, "relight": False}  # pictures of this bake, not of what it lacks
     ours = _sky_only(replace(settings, **fields), SHOW_SAMPLES)
     traced = _sky_only(replace(settings, **fields | {"mode": "traced"}), SHOW_SAMPLES)
@@ -244,11 +243,7 @@ def write_pictures(
         ),
         "traced": with_scale(share, 1.0, f"share of rays traced, mean {mean:.1%} ({settings.mode})"),
     }
-    paths = []
-    for name, pixels in pictures.items():
-        paths.append(folder / f"{name}.png")
-        write_png(paths[-1], np.ascontiguousarray(pixels))
-    return paths
+    return write_pngs(folder, pictures)
 
 
 def _sky_only(settings: Any, samples: int, **more: Any) -> Pipeline:
