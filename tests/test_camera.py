@@ -22,6 +22,14 @@ def test_project_puts_the_target_in_the_middle_and_up_is_up():
     assert np.allclose(pixels[2], [100 + 100 / 5, 50])
 
 
+def test_directions_lead_through_the_pixels_that_points_project_to():
+    camera = Camera.look_at((1, 2, 3), (4, 1, -1), hfov=70, resolution=(200, 100))
+    pixels = np.array([(0, 0), (200, 100), (13.5, 77.25), (100, 50)])
+    directions = camera.directions(pixels)
+    assert np.allclose(np.linalg.norm(directions, axis=1), 1)
+    assert np.allclose(camera.project(camera.position + 3 * directions), pixels)
+
+
 def test_axes_are_made_orthonormal():
     camera = Camera(np.diag([2.0, 3.0, 4.0, 1.0]))
     assert np.allclose(camera.world_from_camera, np.eye(4))

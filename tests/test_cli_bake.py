@@ -12,6 +12,7 @@ from PIL import Image
 
 import warp_gi as gi
 from warp_gi import cli, launch, sequence
+from warp_gi.cli_render import parse
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels.octahedral import octahedral_decode, octahedral_wrap
 from warp_gi.techniques import visibility_export as export
@@ -397,6 +398,34 @@ def test_a_bake_of_probes_is_rendered_alone_and_fits_only_its_settings(probes, t
     fails(["render", "cornell_box", "--pipeline=probes", *out, "--bake", path], "counts: bake has '3x2x2'", capfd)
     fails(["render", "cornell_box", "--pipeline=dvf", *out, "--bake", path], "a bake of LightFieldProbes was", capfd)
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
+
+
+def test_probes_that_follow_a_turning_sky_are_resumed_from_the_start(probes, sky, tmp_path, capsys):
+    """A frame depends on those before it, so all are rendered again, to the same bits; a still sky resumes."""
+    path = probes[0] / "out" / "cornell_box.probes.safetensors"
+    of_render = [f"--indirect.{name}={value}" for name, value in LIGHT.items()] + ["--indirect.counts", *COUNTS]
+    small = ["cornell_box", f"--environment={sky}", "--resolution=24x16", "--spp=1", "--pipeline=probes", *of_render]
+    still = ["render", *small, "--indirect.mode=irradiance", "--frames=0-2", "--bake", str(path)]  # of another sky
+    for command, told in (
+        ([*still, "--environment-turn=30"], "every frame is rendered again: the indirect light follows what changes"),
+        (still, "2 of 3 frames are there already"),
+    ):
+        pattern = tmp_path / str(len(command)) / "a.####.exr"
+        assert cli.main([*command, "-o", str(pattern)]) == 0
+        files = [sequence.frame_path(pattern, index) for index in range(3)]
+        first = [sequence.read_frame(file).numpy("indirect") for file in files]
+        files[1].unlink()
+        capsys.readouterr()
+        assert cli.main([*command, "--resume", "-o", str(pattern)]) == 0
+        assert told in capsys.readouterr().out
+        np.testing.assert_array_equal([sequence.read_frame(file).numpy("indirect") for file in files], first)
+        assert first[0].max() > 0.01
+
+
+def test_a_bake_is_found_wherever_it_stands_among_the_options():
+    for before in (["--preview"], ["--quiet"], []):
+        assert parse([*before, "a.probes.safetensors"]).settings.indirect.primary == "probes"
+    assert parse(["cornell_box", "--bake", "a.probes.safetensors"]).settings.indirect != LightFieldProbes()
 
 
 def test_probes_need_no_camera_and_settled_light_no_advice(tmp_path, capsys, monkeypatch):
