@@ -275,6 +275,28 @@ def test_looks_are_those_that_the_march_counts(state):
     assert max(visited) >= 3 and min(visited) == 1
 
 
+def test_probes_are_asked_from_the_one_nearest_to_the_line_by_steps_of_three(state):
+    """Within a cage: first the corner nearest to the ray's line, then corner (i + 3) mod 8 (section 4.1)."""
+    positions, low, spacing = state.field.positions.numpy().astype(np.float64), state.grid.low, state.grid.spacing
+    offsets = np.array([[corner & 1, corner >> 1 & 1, corner >> 2 & 1] for corner in range(8)])
+    seconds = 0
+    for origin, direction in zip(*random_rays(300), strict=True):
+        cage_at = lambda t: np.clip(np.floor((origin + direction * t - low) / spacing), 0, (1, 1, 0)).astype(int)  # noqa: B023, E731
+        x, y, z = (cage_at(0) + offsets).T
+        corners = (z * 3 + y) * 3 + x
+        away = np.linalg.norm(np.cross(positions[corners] - origin, direction), axis=1)
+        usable = corners != 4
+        looks, _ = rays.ray_looks(state, origin, direction)
+        first = int(np.flatnonzero(corners == looks[0].probe)[0])
+        assert away[first] < away[usable].min() + 1e-5
+        later = [look for look in looks if look.visit == 2]
+        if later and usable[(first + 3) % 8] and (cage_at(later[0].t - 1e-5) == cage_at(0)).all():
+            if (cage_at(later[0].t + 1e-5) == cage_at(0)).all():
+                assert later[0].probe == corners[(first + 3) % 8]
+                seconds += 1
+    assert seconds >= 5
+
+
 def test_a_drawn_ray_shows_its_looks(state):
     """The middle of each texel that the ray was tested against is drawn in its colour, that of no other is."""
     drawn = 0
