@@ -14,14 +14,16 @@ from types import ModuleType
 import warp as wp
 
 import warp_gi.kernels
+from warp_gi.kernels.path_tracers import every_tracer
 
 ARCHITECTURES = (80, 90)
 
 
 def kernel_modules() -> list[str]:
-    """Return the names of the modules in ``kernels/`` that hold kernels, all imported."""
+    """Return the names of all Warp modules with kernels: those of ``kernels/``, and one for each path tracer."""
     names = [info.name for info in pkgutil.iter_modules(warp_gi.kernels.__path__, "warp_gi.kernels.")]
-    return [name for name in names if _has_kernels(importlib.import_module(name))]
+    names = [name for name in names if _has_kernels(importlib.import_module(name))]
+    return sorted([*names, *(tracer.trace_paths.module.name for tracer in every_tracer())])
 
 
 def compile_module(name: str, architectures: Sequence[int], folder: Path) -> list[Path]:

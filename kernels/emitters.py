@@ -1,8 +1,7 @@
-"""Direct light from emissive triangles and punctual lights, selected by an alias table."""
+"""Direct light from emissive triangles and punctual lights; path_samplers.py says which to sample."""
 
 import warp as wp
 
-from warp_gi.kernels.alias import alias_choice
 from warp_gi.kernels.bvh import is_masked, is_transparent
 from warp_gi.kernels.sampling import triangle_barycentrics
 from warp_gi.kernels.surface import emitted_radiance
@@ -10,6 +9,7 @@ from warp_gi.kernels.types import (
     EMITTER_DIRECTIONAL,
     EMITTER_SPOT,
     EMITTER_TRIANGLE,
+    Emitter,
     Emitters,
     SceneData,
 )
@@ -17,6 +17,14 @@ from warp_gi.kernels.types import (
 wp.set_module_options({"enable_backward": False})
 
 INFINITE_DISTANCE = wp.constant(wp.float32(1.0e30))
+
+
+# An emitter to sample.
+@wp.struct
+class LightChoice:
+    item: wp.int32  # -1: none
+    pdf: wp.float32  # probability of selecting it
+    is_new: wp.int32  # 1: no one would have selected it but for exploration
 
 
 # radiance is over pdf already for lights without size (delta = 1), whose pdf is the
@@ -46,11 +54,9 @@ def may_hit_emitter(e: Emitters, origin: wp.vec3, direction: wp.vec3) -> wp.bool
     return enter <= leave and e.lower[0] <= e.upper[0]
 
 
-# Solid-angle pdf of one strategy that picks this emissive triangle and a point uniform on it.
+# Solid-angle pdf of a point uniform on an emissive triangle.
 @wp.func
-def triangle_light_pdf(
-    scene: SceneData, emitter: wp.int32, face: wp.int32, direction: wp.vec3, distance: wp.float32
-) -> wp.float32:
+def triangle_light_pdf(scene: SceneData, face: wp.int32, direction: wp.vec3, distance: wp.float32) -> wp.float32:
     ids = scene.geometry.indices[face]
     p0 = scene.geometry.points[ids[0]]
     normal = wp.cross(scene.geometry.points[ids[1]] - p0, scene.geometry.points[ids[2]] - p0)
@@ -58,7 +64,7 @@ def triangle_light_pdf(
     projected = 0.5 * wp.abs(wp.dot(normal, direction))
     if projected <= 0.0:
         return 0.0
-    return scene.emitters.alias[emitter].pdf * distance * distance / projected
+    return distance * distance / projected
 
 
 # Falloff of KHR_lights_punctual: inverse square, ended smoothly at `range`.
@@ -71,15 +77,41 @@ def distance_falloff(distance: wp.float32, range: wp.float32) -> wp.float32:
     return falloff
 
 
-# One sample of one emitter, as seen from `position`.
+# The light of a punctual emitter at `position`; pdf 1, or 0 where there is none.
 @wp.func
-def sample_emitter(scene: SceneData, position: wp.vec3, u_select: wp.vec2, u: wp.vec2) -> LightSample:
+def punctual_light(light: Emitter, position: wp.vec3) -> LightSample:
     r = LightSample()
-    e = scene.emitters
-    if e.count == 0:
+    r.delta = 1
+    r.pdf = 1.0
+    if light.kind == EMITTER_DIRECTIONAL:
+        r.direction = -light.direction
+        r.distance = INFINITE_DISTANCE
+        r.radiance = light.intensity
         return r
-    choice = alias_choice(e.alias, e.count, u_select[0], u_select[1])
-    light = e.emitters[choice.item]
+    to_light = light.position - position
+    r.distance = wp.length(to_light)
+    if r.distance <= 0.0:
+        r.pdf = 0.0
+        return r
+    r.direction = to_light / r.distance
+    strength = distance_falloff(r.distance, light.range)
+    if light.kind == EMITTER_SPOT:
+        cone = (-wp.dot(r.direction, light.direction) - light.cos_outer) / wp.max(
+            light.cos_inner - light.cos_outer, 1.0e-4
+        )
+        cone = wp.clamp(cone, 0.0, 1.0)
+        strength = strength * cone * cone
+    r.radiance = light.intensity * strength
+    return r
+
+
+# One sample of the emitter that was chosen, as seen from `position`.
+@wp.func
+def sample_emitter(scene: SceneData, position: wp.vec3, choice: LightChoice, u: wp.vec2) -> LightSample:
+    r = LightSample()
+    if choice.item < 0:
+        return r
+    light = scene.emitters.emitters[choice.item]
     if light.kind == EMITTER_TRIANGLE:
         b = triangle_barycentrics(u)
         ids = scene.geometry.indices[light.triangle]
@@ -97,28 +129,10 @@ def sample_emitter(scene: SceneData, position: wp.vec3, u_select: wp.vec2, u: wp
         if is_masked(scene.bvh, light.triangle):  # no ray meets it where it has a hole
             if is_transparent(scene.bvh, light.triangle, b[0], b[1]):
                 return r
-        r.pdf = triangle_light_pdf(scene, choice.item, light.triangle, r.direction, r.distance)
+        r.pdf = choice.pdf * triangle_light_pdf(scene, light.triangle, r.direction, r.distance)
         r.radiance = emitted_radiance(scene, light.triangle, b[0], b[1])
         return r
-    r.delta = 1
-    r.pdf = choice.pdf
-    if light.kind == EMITTER_DIRECTIONAL:
-        r.direction = -light.direction
-        r.distance = INFINITE_DISTANCE
-        r.radiance = light.intensity / r.pdf
-        return r
-    to_light = light.position - position
-    r.distance = wp.length(to_light)
-    if r.distance <= 0.0:
-        r.pdf = 0.0
-        return r
-    r.direction = to_light / r.distance
-    strength = distance_falloff(r.distance, light.range)
-    if light.kind == EMITTER_SPOT:
-        cone = (-wp.dot(r.direction, light.direction) - light.cos_outer) / wp.max(
-            light.cos_inner - light.cos_outer, 1.0e-4
-        )
-        cone = wp.clamp(cone, 0.0, 1.0)
-        strength = strength * cone * cone
-    r.radiance = light.intensity * (strength / r.pdf)
+    r = punctual_light(light, position)
+    r.pdf = r.pdf * choice.pdf
+    r.radiance = r.radiance / choice.pdf
     return r

@@ -26,7 +26,7 @@ from warp_gi.kernels.light_field import (
 )
 from warp_gi.kernels.light_field_place import PROBE_FACTOR, sees_back
 from warp_gi.kernels.octahedral import octahedral_decode, octahedral_wrap
-from warp_gi.kernels.path_trace import TERM_EMITTERS, TERM_ENVIRONMENT, PathSettings, trace_path
+from warp_gi.kernels.path_trace import TERM_EMITTERS, TERM_ENVIRONMENT, PathSamplers, PathSettings, trace_path
 from warp_gi.kernels.sampling import hash_uint, morton_code, sample_2d
 from warp_gi.kernels.surface import surface_emission, surface_shape, with_color
 from warp_gi.kernels.types import SceneData
@@ -97,7 +97,7 @@ def sample_texel(
     paths.max_depth = 2
     paths.roulette_depth = 2
     paths.sky_probability = work.sky_probability
-    light = trace_path(scene, s, -direction, paths, index, seed)
+    light = trace_path(scene, PathSamplers(), hit, s, -direction, paths, index, seed, -1)
     r.direct = light.environment + light.emitters
     return r
 

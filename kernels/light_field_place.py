@@ -5,7 +5,14 @@ import warp as wp
 from warp_gi.kernels.bvh import bvh_intersect
 from warp_gi.kernels.environment import environment_radiance
 from warp_gi.kernels.light_field import LightField
-from warp_gi.kernels.path_trace import TERM_EMITTERS, TERM_ENVIRONMENT, TERM_INDIRECT, PathSettings, trace_path
+from warp_gi.kernels.path_trace import (
+    TERM_EMITTERS,
+    TERM_ENVIRONMENT,
+    TERM_INDIRECT,
+    PathSamplers,
+    PathSettings,
+    trace_path,
+)
 from warp_gi.kernels.sampling import hash_uint
 from warp_gi.kernels.surface import surface_at, surface_emission
 from warp_gi.kernels.types import SceneData
@@ -95,7 +102,8 @@ def measure_light(
     paths.sky_probability = sky_probability
     s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
     seed = hash_uint(wp.uint32(point) * PROBE_FACTOR)
-    path = trace_path(scene, s, -direction, paths, wp.uint32(i - point * directions), seed)
+    index = wp.uint32(i - point * directions)
+    path = trace_path(scene, PathSamplers(), hit, s, -direction, paths, index, seed, -1)
     total = path.environment + path.emitters + path.indirect
     total = total + surface_emission(scene, hit.face, hit.u, hit.v, -direction)
     light[i] = (total[0] + total[1] + total[2]) / 3.0

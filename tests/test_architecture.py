@@ -112,7 +112,7 @@ def test_kernel_modules_are_found_and_compile_for_cuda(tmp_path):
     from warp_gi.bench import compile_cuda
 
     names = compile_cuda.kernel_modules()
-    assert {Path(p).stem for p in KERNELS if "@wp.kernel" in p.read_text()} == {n.rpartition(".")[2] for n in names}
+    assert {Path(p).stem for p in KERNELS if "@wp.kernel" in p.read_text()} == {n.split(".")[2] for n in names}
     paths = compile_cuda.compile_module("warp_gi.kernels.compose", (80, 90), tmp_path)
     assert len(paths) == 2
 

@@ -232,7 +232,7 @@ BAD = [
     (["render", "cornell_box", "--pipeline", "path,indirect=BsdfPath"], "did you mean 'BsdfPaths'?"),
     (["render", "cornell_box", "--pipeline", "path,emitter=none"], "did you mean 'emitters'?"),
     (["render", "cornell_box", "--camera", "none.json"], "none.json"),
-    (["render", "cornell_box", "--camera", "mian"], "unknown camera 'mian'; did you mean 'main'?"),
+    (["render", "cornell_box", "--camera", "mainn"], "unknown camera 'mainn'; did you mean 'main'?"),
     (["render", "cornell_box", "--eye", "0", "0", "0"], "--eye and --target go together"),
     (["render", "cornell_box", "--hfov", "40"], "--hfov goes with a still camera"),
     (["render", "cornell_box", "--frames", "3-1"], "frames '3-1' not understood"),

@@ -11,7 +11,9 @@ from statistics_tools import every_device  # noqa: F401
 import warp_gi as gi
 from warp_gi.bench.presets import quad
 from warp_gi.kernels.emitters import sample_emitter
+from warp_gi.kernels.path_samplers import AliasLights, alias_light
 from warp_gi.kernels.sampling import sample_2d
+from warp_gi.kernels.surface import Surface
 from warp_gi.kernels.types import SceneData
 from warp_gi.launch import launch
 
@@ -30,7 +32,9 @@ def sample_lights(
 ):
     i = first + wp.tid()
     seed = wp.uint32(3 * i + 1)
-    r = sample_emitter(scene, position, sample_2d(wp.uint32(0), seed, 0), sample_2d(wp.uint32(0), seed, 1))
+    u = sample_2d(wp.uint32(0), seed, 0)
+    choice = alias_light(AliasLights(), scene, -1, Surface(), position, u)
+    r = sample_emitter(scene, position, choice, sample_2d(wp.uint32(0), seed, 1))
     to_light[i] = wp.vec4(r.direction[0], r.direction[1], r.direction[2], r.distance)
     pdf[i] = r.pdf
     radiance[i] = r.radiance

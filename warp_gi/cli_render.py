@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import signal
 import sys
@@ -21,7 +22,7 @@ from warp_gi.camera import Camera, CameraPath
 from warp_gi.cli_inputs import DEFAULT_SCENE, SceneOptions, find_camera, find_scene, parse_resolution
 from warp_gi.cli_options import flag, parse_options, value_given
 from warp_gi.cli_report import Reporter, start_warp
-from warp_gi.errors import OptionError, unknown_name
+from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.files import check_writable, remove_stale_parts
 from warp_gi.pipeline import TERMS, Estimator, Pipeline
 from warp_gi.scene.baked import BakedScene
@@ -202,15 +203,21 @@ def run(options: Render, report: Reporter) -> None:
     scheduler = FrameScheduler(source, camera, options.settings, options.device, options.seed, report.stage, bakes)
     with report.phase("bake"):
         scheduler.bake()
-    todo = []
+    done, lineages = [], []
     for shot in shots:
-        if options.resume:
+        if options.resume or scheduler.learns:
             turn_sky(options, scene, sky, shot.index)  # what the frame's file has to say
-        if not options.resume or not is_done(options, shot, scheduler, report):
-            todo.append(shot)
-    if todo and len(todo) < len(shots) and (reason := what_remembers(options, scene)):
-        report.line(f"every frame is rendered again: {reason} by the frames before")
-        todo = shots
+        if scheduler.learns:
+            lineages.append(lineage(options, shot, scheduler, lineages[-1] if lineages else ""))
+        done.append(options.resume and is_done(options, shot, scheduler, report))
+    todo = [shot for shot, is_there in zip(shots, done, strict=True) if not is_there]
+    if todo and any(done):
+        reason = what_remembers(options, scene)
+        if reason or scheduler.learns:
+            todo = shots if reason else shots[known_frames(options, scheduler, lineages[: done.index(False)]) :]
+        if len(todo) == len(shots):
+            reason = reason or "no saved state fits, and light is learnt"
+            report.line(f"every frame is rendered again: {reason} by the frames before")
     if todo:
         check_writable(options.output.parent)
     if len(todo) < len(shots):
@@ -223,6 +230,8 @@ def run(options: Render, report: Reporter) -> None:
                 turn_sky(options, scene, sky, shot.index)
                 for stage, seconds in render_shot(options, shot, scheduler, report).items():
                     times.setdefault(stage, []).append(seconds)
+                if scheduler.learns:
+                    scheduler.save_state(state_path(options), lineages[shots.index(shot)])
                 if stop.is_set():
                     raise KeyboardInterrupt
     except KeyboardInterrupt:
@@ -305,8 +314,37 @@ def turn_sky(options: Render, scene: Scene, sky: Environment | None, index: int)
             scene.environment = turned
 
 
+def state_path(options: Render) -> Path:
+    """Return where a sequence keeps what it has learnt, beside its frames."""
+    stem = options.output.stem.replace("#", "").strip("._-") or "frames"
+    return options.output.with_name(f"{stem}.state.safetensors")
+
+
+def lineage(options: Render, shot: Shot, scheduler: FrameScheduler, before: str) -> str:
+    """Return a hash of all that decides a frame and those before it, whose hash is ``before``."""
+    attributes = frame_attributes(
+        shot.index, shot.time, shot.camera, scheduler.metadata(), shot.previous_camera, options.precision
+    )
+    return hashlib.sha256(f"{before}{attributes}".encode()).hexdigest()
+
+
+def known_frames(options: Render, scheduler: FrameScheduler, lineages: list[str]) -> int:
+    """Return how many of the first frames, which are whole, a saved state knows; the scheduler then goes on from it."""
+    path = state_path(options)
+    if not path.exists():
+        return 0
+    try:
+        known = load_bake(path).settings.get("lineage")
+        if known not in lineages:
+            return 0
+        scheduler.load_state(path, known)
+    except BakeError:  # damaged
+        return 0
+    return lineages.index(known) + 1
+
+
 def what_remembers(options: Render, scene: Scene | BakedScene) -> str:
-    """Return what makes a frame depend on those before it, or nothing."""
+    """Return what makes a frame depend on those before it in a way that no file keeps, or nothing."""
     settings = options.settings
     if settings.denoise is not None and settings.denoise.remembers:
         return "the denoiser goes"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -12,6 +12,14 @@ if TYPE_CHECKING:
     from warp_gi.camera import Camera, CameraPath
     from warp_gi.scene.scene import Scene
     from warp_gi.scheduler import Frame
+    from warp_gi.techniques.sample_octree import Lesson
+
+
+class SamplerInUse(NamedTuple):
+    """A sampler of ``kernels.path_samplers`` and the struct of data that it gets in this frame."""
+
+    sampler: Any
+    data: Any
 
 
 @dataclass(frozen=True)
@@ -34,6 +42,11 @@ class Estimator:
     @property
     def remembers(self) -> bool:
         """Whether frames depend on those before, if the scene or its sky changes."""
+        return False
+
+    @property
+    def learns(self) -> bool:
+        """Whether it learns from the samples that the paths of a frame leave, region by region; see ``learn``."""
         return False
 
     def __post_init__(self) -> None:
@@ -82,3 +95,7 @@ class Estimator:
     def trace(self, frame: Frame, state: Any) -> None:
         """Add this term's samples of the current camera sample to the frame's buffers."""
         raise NotImplementedError
+
+    def learn(self, lesson: Lesson, state: Any) -> Any:
+        """Return the state after a frame, from the samples of its paths; asked of an estimator that ``learns``."""
+        return state

@@ -11,8 +11,12 @@ from warp_gi.denoise import Denoiser, Oidn, SpatioTemporal, denoiser_named
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.techniques.baselines import BsdfPaths, PowerLights, TracedEnvironment, UniformLights
+from warp_gi.techniques.guided_paths import GuidedPaths
 from warp_gi.techniques.light_field_probes import LightFieldProbes
+from warp_gi.techniques.light_hierarchy import LightHierarchy
+from warp_gi.techniques.sample_octree import SampleOctree
 from warp_gi.techniques.visibility_field import VisibilityField
+from warp_gi.techniques.visibility_light_cache import VisibilityLightCache
 
 __all__ = ["PRESETS", "TERMS", "Estimator", "Pipeline"]
 
@@ -30,9 +34,9 @@ class Pipeline:
 
     environment: TracedEnvironment | VisibilityField | None = TracedEnvironment()
     """Direct light from the sky."""
-    emitters: PowerLights | UniformLights | None = PowerLights()
+    emitters: PowerLights | UniformLights | LightHierarchy | VisibilityLightCache | None = PowerLights()
     """Direct light from emissive triangles and punctual lights."""
-    indirect: BsdfPaths | LightFieldProbes | None = BsdfPaths()
+    indirect: BsdfPaths | GuidedPaths | LightFieldProbes | None = BsdfPaths()
     """Light that arrives over other surfaces."""
     spp: int = 16
     """Samples a pixel."""
@@ -43,6 +47,9 @@ class Pipeline:
     """Pixel filter: "box" or "tent" (two pixels wide)."""
     denoise: SpatioTemporal | Oidn | None = None
     """What makes the beauty of the noisy terms, or its name: "spatiotemporal", "oidn". The terms stay noisy."""
+
+    octree: SampleOctree = SampleOctree()
+    """Where the techniques that learn from samples learn: VisibilityLightCache and GuidedPaths share it."""
 
     def __post_init__(self) -> None:
         for name in ("spp", "camera_samples"):
@@ -88,7 +95,9 @@ class Pipeline:
         settings: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, Estimator | Denoiser):
+            if field.name == "octree" and not any(estimator.learns for _, estimator in self.estimators()):
+                continue
+            if isinstance(value, Estimator | Denoiser | SampleOctree):
                 settings[field.name] = type(value).__name__
                 settings.update({f"{field.name}.{name}": setting for name, setting in asdict(value).items()})
             else:
@@ -115,6 +124,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     "path": {},
     "direct": {"indirect": None},
     "dvf": {"environment": VisibilityField()},
+    "reuse": {"emitters": VisibilityLightCache(), "indirect": GuidedPaths()},
+    "hybrid": {"environment": VisibilityField(), "emitters": VisibilityLightCache(), "indirect": GuidedPaths()},
     "probes": {"indirect": LightFieldProbes()},
     "probe_view": {"environment": None, "emitters": None, "indirect": LightFieldProbes(primary="probes")},
 }

@@ -8,6 +8,7 @@ from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from numbers import Integral
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,14 +16,15 @@ import warp as wp
 
 import warp_gi
 from warp_gi import launch
-from warp_gi.baking import Bake
+from warp_gi.baking import Bake, load_bake
 from warp_gi.camera import Camera, CameraPath
 from warp_gi.errors import BakeError, OptionError, unknown_name
-from warp_gi.estimator import Estimator
-from warp_gi.kernels import compose, denoise, gbuffer, path_trace, types
+from warp_gi.estimator import Estimator, SamplerInUse
+from warp_gi.kernels import compose, denoise, gbuffer, path_samplers, path_trace, path_tracers, samples, types
 from warp_gi.pipeline import TERMS, Pipeline
 from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.scene import Scene
+from warp_gi.sequence_state import state_arrays, with_arrays
 from warp_gi.techniques.baselines import BsdfPaths, PowerLights, sky_probability
 
 _VEC3_BUFFERS = ("beauty", "emission", *TERMS, "albedo", "normal", "position", "variance", "moment1", "moment2")
@@ -72,6 +74,12 @@ class Frame:
         self.timings: dict[str, float] = {}
         """Wall seconds by stage; "compile" is kernel compilation, left out of the others."""
         self.metadata: dict[str, str | int | float] = {}
+        self.lights = SamplerInUse(path_samplers.ALIAS_LIGHTS, path_samplers.AliasLights())
+        """Which light the vertices of paths sample; set by the estimator of the emitters."""
+        self.directions = SamplerInUse(path_samplers.BSDF_DIRECTIONS, path_samplers.BsdfDirections())
+        """Which way paths go on; set by the estimator of the indirect light."""
+        self.regions = SamplerInUse(path_samplers.NO_REGIONS, path_samplers.NoRegions())
+        """What samplers learn in, and from."""
         self._path_terms = 0
         self._paths = BsdfPaths(max_depth=2)
         width, height = camera.resolution
@@ -134,9 +142,14 @@ class Frame:
         paths.roulette_depth = self._paths.roulette_depth
         paths.clamp = self._paths.clamp
         paths.sky_probability = self._sky_probability
+        paths.spp = self.pipeline.spp
+        tracer = path_tracers.tracer(self.lights.sampler, self.directions.sampler)
+        samplers = tracer.samplers()
+        for name in ("lights", "directions", "regions"):
+            setattr(samplers, name, getattr(self, name).data)
         buffers = self.struct(path_trace.PathBuffers)
-        inputs = [self.data, self.camera_data, self.pass_settings, paths, self.hits, buffers]
-        self.launch_tiled(path_trace.trace_paths, inputs)
+        inputs = [self.data, self.camera_data, self.pass_settings, paths, self.hits, buffers, samplers]
+        self.launch_tiled(tracer.trace_paths, inputs)
 
     def moments(self, name: str) -> tuple[wp.array, wp.array]:
         """Return sums of an independent launch's samples and of their squares, which the variance buffer adds."""
@@ -241,6 +254,8 @@ class FrameScheduler:
             self._light_sampler = PowerLights()  # next-event estimation along paths needs a distribution anyway
         else:
             self._light_sampler = None
+        self._learners = [term for term, estimator in self._estimators.items() if estimator.learns]
+        self._records: samples.SampleRecords | None = None
         self._bakes = _bakes_by_term(bakes, self._estimators)
         self._bake_digests = {f"bake.{term}": bake.digest[:16] for term, bake in self._bakes.items()}
         self._states: dict[str, Any] = {}
@@ -266,6 +281,9 @@ class FrameScheduler:
             if key and self._keys.get(term) == key:
                 continue
             self._states[term], self._keys[term] = self._start(term, estimator), key
+        if self._learners and self._keys.get("octree") != self.scene.contents_hash:
+            self._states["octree"] = self.pipeline.octree.start(self.scene, self.device)
+            self._keys["octree"] = self.scene.contents_hash
         self._scene_hash = self.scene.hash
         self._bake_seconds = time.perf_counter() - started
         self._baked_version = self.scene.version
@@ -303,17 +321,77 @@ class FrameScheduler:
                 self._states[term] = estimator.preprocess(frame, self._states[term])
         if self._light_sampler is not None:
             self._states["lights"] = self._light_sampler.preprocess(frame, self._states.get("lights"))
+        if self._learners:
+            with frame.stage("preprocess octree"):
+                self._open_records(frame)
         views = self.pipeline.camera_sample_count
         for view in range(views):
             self._trace_view(frame, view)
             self._progress("trace", (view + 1) / views)
         with frame.stage("compose"):
             frame.launch(compose.compose_frame, [views, self.pipeline.spp, frame.struct(compose.FrameSums)])
+        if self._learners:
+            self._learn(frame)
         if self.pipeline.denoise is not None:
             with frame.stage("denoise"):
                 frame.keep_noisy()
                 self._states["denoise"] = self.pipeline.denoise.apply(frame, self._states["denoise"])
         return frame
+
+    def _open_records(self, frame: Frame) -> None:
+        """Let the paths of a frame find regions, and leave samples."""
+        indirect = self.pipeline.indirect
+        vertices = indirect.max_depth - 1 if isinstance(indirect, BsdfPaths) else 1
+        data = samples.SampleRegions()
+        data.octree, data.moves = self._states["octree"].octree, int(self.scene.is_animated)
+        data.records = self._records = self.pipeline.octree.records(frame, vertices, self._records)
+        frame.regions = SamplerInUse(samples.SAMPLE_REGIONS, data)
+
+    def _learn(self, frame: Frame) -> None:
+        """Let every technique that learns take over what the samples of a frame say."""
+        with frame.stage("learn octree"):
+            lesson = self.pipeline.octree.learn(self._states["octree"], self._records, self.device)
+            self._states["octree"] = lesson.octree
+        for term in self._learners:
+            with frame.stage(f"learn {term}"):
+                self._states[term] = self._estimators[term].learn(lesson, self._states[term])
+
+    @property
+    def learns(self) -> bool:
+        """Whether an estimator learns from the frames, so that there is a state to save."""
+        return bool(self._learners)
+
+    def save_state(self, path: str | Path, lineage: str = "") -> Path:
+        """Write what is known after the last frame, whole or not at all: ``load_state`` goes on from there.
+
+        What is saved is what estimators that learn from samples have learnt. ``lineage`` names the frames that it
+        was learnt from. Raises OSError when the file cannot be written.
+        """
+        return self._saved_state(lineage, state_arrays(self._learnt())).save(path)
+
+    def load_state(self, path: str | Path, lineage: str = "") -> None:
+        """Go on from a file of ``save_state``, as if the frames before had been rendered here: bit for bit.
+
+        Raises BakeError when the file is damaged, or of another scene, other settings or another ``lineage``.
+        """
+        self.bake()
+        saved, wanted = load_bake(path), self._saved_state(lineage, {})
+        saved.check(wanted.technique, wanted.scene_key, wanted.settings, wanted.scene_name)
+        try:
+            self._states |= with_arrays(self._learnt(), saved.arrays, self.device)
+        except (KeyError, ValueError) as error:
+            raise BakeError(f"{path}: does not hold the state of these estimators ({error}); delete it") from error
+
+    def _learnt(self) -> dict[str, Any]:
+        self.bake()
+        return {name: self._states[name] for name in (["octree"] * bool(self._learners)) + self._learners}
+
+    def _saved_state(self, lineage: str, arrays: dict[str, np.ndarray]) -> Bake:
+        """Return a file's contents; the sky may differ from that of the frame before."""
+        settings = {key: value for key, value in self.metadata().items() if key != "scene_hash"}
+        settings = {key: "None" if value is None else value for key, value in settings.items()}
+        settings |= {"lineage": lineage}
+        return Bake("FrameScheduler", self.scene.contents_hash, settings, arrays, scene_name=self.scene.name)
 
     def _new_frame(self, index: int, previous_index: int) -> Frame:
         fps = self.camera.fps if isinstance(self.camera, CameraPath) else 24.0

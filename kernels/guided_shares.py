@@ -1,0 +1,112 @@
+"""Learning how often to ask the BSDF rather than the quadtree: the share whose samples would have varied least.
+
+A sample of light c drawn with density p is c^2 p / p_a of the second moment that the mixture with share a would have,
+p_a = a p_bsdf + (1 - a) p_guide: its expectation is the integral of f^2 / p_a. A few shares are tried on the same
+samples, and the one with the least sum is taken. Sums of earlier frames fade.
+"""
+
+import warp as wp
+
+from warp_gi.kernels.light_cache_build import LeafSamples
+from warp_gi.kernels.samples import SURFACE_GLOSSY, SampleRecords
+
+wp.set_module_options({"enable_backward": False})
+
+SHARES = 6
+ShareMoments = wp.types.vector(length=SHARES, dtype=wp.float32)
+FADING = wp.constant(wp.float32(0.8))  # of what is known, each frame
+
+
+# One of the shares that are tried.
+@wp.func
+def candidate_share(k: wp.int32) -> wp.float32:
+    if k == 0:
+        return 0.1
+    if k == 1:
+        return 0.25
+    if k == 2:
+        return 0.5
+    if k == 3:
+        return 0.75
+    if k == 4:
+        return 0.9
+    return 0.97
+
+
+# Share with the least moment; where nothing is known, `otherwise`.
+@wp.func
+def best_share(moments: ShareMoments, otherwise: wp.float32) -> wp.float32:
+    best = float(otherwise)
+    least = float(wp.inf)
+    for k in range(SHARES):
+        if moments[k] > 0.0 and moments[k] < least:
+            least = moments[k]
+            best = candidate_share(k)
+    return best
+
+
+@wp.struct
+class GuideKnowledge:
+    trees: wp.array(dtype=wp.vec4ui)  # [leaf]
+    shares: wp.array(dtype=wp.vec2)  # [leaf]
+    moments: wp.array(dtype=ShareMoments)  # [2 leaf + is glossy]
+
+
+# Thread: a leaf. Takes over what the leaf of the previous tree knew; `first_tree` where there was none.
+@wp.kernel
+def take_over_guides(
+    first: wp.int32,
+    origins: wp.array(dtype=wp.int32),
+    known: GuideKnowledge,
+    guides: GuideKnowledge,
+    first_tree: wp.vec4ui,
+    first_share: wp.float32,
+):
+    leaf = first + wp.tid()
+    origin = origins[leaf]
+    if origin < 0:
+        guides.trees[leaf] = first_tree
+        guides.shares[leaf] = wp.vec2(first_share, first_share)
+        guides.moments[2 * leaf] = ShareMoments()
+        guides.moments[2 * leaf + 1] = ShareMoments()
+        return
+    guides.trees[leaf] = known.trees[origin]
+    guides.shares[leaf] = known.shares[origin]
+    guides.moments[2 * leaf] = known.moments[2 * origin]
+    guides.moments[2 * leaf + 1] = known.moments[2 * origin + 1]
+
+
+# Thread: a leaf. Adds its samples to the moments of every share, and chooses.
+@wp.kernel
+def adapt_shares(
+    first: wp.int32, samples: LeafSamples, records: SampleRecords, guides: GuideKnowledge, first_share: wp.float32
+):
+    leaf = first + wp.tid()
+    count = samples.counts[leaf]
+    if count == 0:
+        return
+    rough = guides.moments[2 * leaf] * FADING
+    glossy = guides.moments[2 * leaf + 1] * FADING
+    looks = wp.min(count, samples.most)
+    for k in range(looks):
+        i = wp.int32(wp.int64(k) * wp.int64(count) / wp.int64(looks))
+        slot = samples.order[samples.starts[leaf] + i]
+        contribution = records.contributions[slot]
+        if contribution > 0.0:
+            word = records.mixtures[slot]
+            share = wp.float32(word >> wp.uint32(16)) / 65535.0
+            posterior = wp.float32(word & wp.uint32(0xFFFF)) / 65535.0
+            by_bsdf = posterior / share  # density of the BSDF alone over that of the mixture
+            by_guide = (1.0 - posterior) / (1.0 - share)
+            square = contribution * contribution
+            is_glossy = (records.lights[slot] & SURFACE_GLOSSY) != wp.uint32(0)
+            for c in range(SHARES):
+                a = candidate_share(c)
+                moment = square / wp.max(a * by_bsdf + (1.0 - a) * by_guide, 1.0e-6)
+                if is_glossy:
+                    glossy[c] = glossy[c] + moment
+                else:
+                    rough[c] = rough[c] + moment
+    guides.moments[2 * leaf] = rough
+    guides.moments[2 * leaf + 1] = glossy
+    guides.shares[leaf] = wp.vec2(best_share(rough, first_share), best_share(glossy, first_share))

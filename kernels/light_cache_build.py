@@ -1,0 +1,267 @@
+"""Making a region's light cache from the last frame's samples (temporal_reuse.txt, section 4.1).
+
+Lights that a region's samples saw are listed once each (`list_seen_lights`), joined with those of its six neighbours
+and with what it knew before (`join_lights`), and spread over buckets (`count_buckets`, `fill_buckets`). Lists are
+sorted by emitter, so joining is a merge, and buckets come out sorted. An entry is emitter << 8 | frames since a sample
+of the region or its neighbours saw it: a light that is seen rarely stays for some frames, which the paper leaves for
+future work (section 8).
+"""
+
+import warp as wp
+
+from warp_gi.kernels.light_cache import MOST_BUCKETS, CacheTables
+from warp_gi.kernels.octree import NEIGHBOURS
+from warp_gi.kernels.samples import LIGHT_ITEM, LIGHT_NEW, LIGHT_VISIBLE
+
+wp.set_module_options({"enable_backward": False})
+
+MOST_LISTED = wp.constant(1024)  # lights of one region
+FREE = wp.constant(-1)
+LISTS = 8  # that are joined: a region's own, its neighbours', and what it knew
+ListEnds = wp.types.vector(length=LISTS, dtype=wp.int32)
+LATEST = wp.constant(0x7FFFFFFF)
+
+
+# Samples by leaf.
+@wp.struct
+class LeafSamples:
+    starts: wp.array(dtype=wp.int32)  # [leaf] first in `order`
+    counts: wp.array(dtype=wp.int32)  # [leaf]
+    order: wp.array(dtype=wp.int32)  # slots, leaf by leaf
+    most: wp.int32  # samples that are looked at in one leaf, evenly spread
+
+
+# Lists of lights by leaf.
+@wp.struct
+class LightLists:
+    offsets: wp.array(dtype=wp.int32)  # [leaf] start in `entries`
+    counts: wp.array(dtype=wp.int32)  # [leaf]
+    entries: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class CacheSettings:
+    capacity: wp.int32  # lights a bucket
+    hysteresis: wp.float32  # share of the capacity that must suffice for fewer buckets than before
+    memory: wp.int32  # frames that a light stays after it was last seen
+    exploration: wp.float32  # largest share of samples that explore
+    least_exploration: wp.float32
+
+
+# Ascending order, by Shell's method.
+@wp.func
+def sort_entries(entries: wp.array(dtype=wp.int32), begin: wp.int32, count: wp.int32):
+    gap = int(1)
+    while gap < count:
+        gap = gap * 3 + 1
+    while gap > 0:
+        for i in range(gap, count):
+            value = entries[begin + i]
+            j = int(i)
+            while j >= gap and entries[begin + j - gap] > value:
+                entries[begin + j] = entries[begin + j - gap]
+                j -= gap
+            entries[begin + j] = value
+        gap = gap / 3
+
+
+# Thread: a leaf. Lists the lights that its samples saw in the place of its samples, twice as wide, by way of a hash
+# table there; and counts samples that saw a light which exploration alone had found.
+@wp.kernel
+def list_seen_lights(
+    first: wp.int32,
+    samples: LeafSamples,
+    lights: wp.array(dtype=wp.uint32),
+    seen: LightLists,
+    discoveries: wp.array(dtype=wp.int32),
+):
+    leaf = first + wp.tid()
+    count = samples.counts[leaf]
+    begin = 2 * samples.starts[leaf]
+    seen.offsets[leaf] = begin
+    size = int(1)
+    while size * 2 <= 2 * count:
+        size = size * 2
+    for i in range(size * wp.min(count, 1)):
+        seen.entries[begin + i] = FREE
+    looks = wp.min(count, samples.most)
+    found = int(0)
+    new = int(0)
+    for k in range(looks):
+        i = wp.int32(wp.int64(k) * wp.int64(count) / wp.int64(looks))
+        word = lights[samples.order[samples.starts[leaf] + i]]
+        if (word & LIGHT_VISIBLE) != wp.uint32(0) and found < MOST_LISTED:
+            entry = (wp.int32(word & LIGHT_ITEM) - 1) << 8
+            place = wp.int32((wp.uint32(entry) * wp.uint32(0x9E3779B1)) >> wp.uint32(12)) & (size - 1)
+            while seen.entries[begin + place] != FREE and seen.entries[begin + place] != entry:
+                place = (place + 1) & (size - 1)
+            if seen.entries[begin + place] == FREE:
+                seen.entries[begin + place] = entry
+                found += 1
+            if (word & LIGHT_NEW) != wp.uint32(0):
+                new += 1
+    listed = int(0)
+    for i in range(size * wp.min(found, 1)):
+        entry = seen.entries[begin + i]
+        if entry != FREE:
+            seen.entries[begin + listed] = entry
+            listed += 1
+    sort_entries(seen.entries, begin, found)
+    seen.counts[leaf] = found
+    discoveries[leaf] = new
+
+
+# Thread: a leaf. The longest that its joined list can be.
+@wp.kernel
+def bound_lists(
+    first: wp.int32,
+    seen: LightLists,
+    known: LightLists,
+    neighbours: wp.array(dtype=wp.int32),
+    origins: wp.array(dtype=wp.int32),
+    bounds: wp.array(dtype=wp.int32),
+):
+    leaf = first + wp.tid()
+    bound = int(0)
+    if origins[leaf] >= 0:
+        bound = seen.counts[leaf] + known.counts[origins[leaf]]
+        for face in range(NEIGHBOURS):
+            neighbour = neighbours[leaf * NEIGHBOURS + face]
+            if neighbour >= 0:
+                bound += seen.counts[neighbour]
+    bounds[leaf] = wp.min(bound, MOST_LISTED)
+
+
+# Thread: a leaf. Joins the lights that it and its neighbours saw with those that it knew; `joined.counts` holds what
+# bound_lists says, and then how many there are.
+@wp.kernel
+def join_lights(
+    first: wp.int32,
+    seen: LightLists,
+    known: LightLists,
+    neighbours: wp.array(dtype=wp.int32),
+    origins: wp.array(dtype=wp.int32),
+    joined: LightLists,
+    memory: wp.int32,
+):
+    leaf = first + wp.tid()
+    begin = joined.offsets[leaf]
+    most = joined.counts[leaf]
+    heads = ListEnds()
+    ends = ListEnds()
+    if most > 0:
+        heads[0] = seen.offsets[leaf]
+        ends[0] = heads[0] + seen.counts[leaf]
+        heads[7] = known.offsets[origins[leaf]]
+        ends[7] = heads[7] + known.counts[origins[leaf]]
+        for face in range(NEIGHBOURS):
+            neighbour = neighbours[leaf * NEIGHBOURS + face]
+            if neighbour >= 0:
+                heads[1 + face] = seen.offsets[neighbour]
+                ends[1 + face] = heads[1 + face] + seen.counts[neighbour]
+    count = int(0)
+    while count < most:
+        entry = int(LATEST)
+        for k in range(7):
+            if heads[k] < ends[k]:
+                entry = wp.min(entry, seen.entries[heads[k]])
+        if heads[7] < ends[7]:
+            entry = wp.min(entry, known.entries[heads[7]] + 1)
+        if entry == LATEST:
+            break
+        for k in range(7):
+            if heads[k] < ends[k] and (seen.entries[heads[k]] >> 8) == (entry >> 8):
+                heads[k] = heads[k] + 1
+        if heads[7] < ends[7] and (known.entries[heads[7]] >> 8) == (entry >> 8):
+            heads[7] = heads[7] + 1
+        if (entry & 255) <= memory:
+            joined.entries[begin + count] = entry
+            count += 1
+    joined.counts[leaf] = count
+
+
+# Lights in the fullest of `buckets` buckets, which are those of the emitter's last bits.
+@wp.func
+def fullest_bucket(entries: wp.array(dtype=wp.int32), begin: wp.int32, count: wp.int32, buckets: wp.int32) -> wp.int32:
+    most = int(0)
+    for bucket in range(buckets):
+        held = int(0)
+        for i in range(count):
+            if ((entries[begin + i] >> 8) & (buckets - 1)) == bucket:
+                held += 1
+        most = wp.max(most, held)
+    return most
+
+
+# Thread: a leaf. Chooses the number of its buckets: the least that hold its lights.
+@wp.kernel
+def count_buckets(
+    first: wp.int32,
+    settings: CacheSettings,
+    joined: LightLists,
+    origins: wp.array(dtype=wp.int32),
+    known: CacheTables,
+    tables: CacheTables,
+    sizes: wp.array(dtype=wp.int32),
+):
+    leaf = first + wp.tid()
+    count = joined.counts[leaf]
+    buckets = int(0)
+    if count > 0:
+        before = known.buckets[origins[leaf]] & 0xFFFF
+        buckets = int(1)
+        while buckets < MOST_BUCKETS:
+            limit = settings.capacity
+            if buckets < before:
+                limit = wp.int32(wp.float32(settings.capacity) * settings.hysteresis)
+            if fullest_bucket(joined.entries, joined.offsets[leaf], count, buckets) <= limit:
+                break
+            buckets = buckets * 2
+    tables.buckets[leaf] = buckets
+    sizes[leaf] = buckets + count
+
+
+# Thread: a leaf. Spreads its lights over its buckets; what does not fit into the last of them is left to exploration.
+@wp.kernel
+def fill_buckets(first: wp.int32, settings: CacheSettings, joined: LightLists, tables: CacheTables):
+    leaf = first + wp.tid()
+    buckets = tables.buckets[leaf]
+    begin = joined.offsets[leaf]
+    start = tables.offsets[leaf]
+    place = int(0)
+    empty = int(0)
+    for bucket in range(buckets):
+        held = int(0)
+        for i in range(joined.counts[leaf]):
+            emitter = joined.entries[begin + i] >> 8
+            if (emitter & (buckets - 1)) == bucket and held < settings.capacity:
+                tables.items[start + buckets + place] = emitter
+                place += 1
+                held += 1
+        tables.items[start + bucket] = place
+        if held == 0:
+            empty += 1
+    tables.buckets[leaf] = buckets | (empty << 16)
+
+
+# Thread: a leaf. Its share of exploration: doubled where something new was found, a quarter less where not. A leaf
+# without samples keeps its share.
+@wp.kernel
+def adapt_exploration(
+    first: wp.int32,
+    settings: CacheSettings,
+    samples: LeafSamples,
+    discoveries: wp.array(dtype=wp.int32),
+    origins: wp.array(dtype=wp.int32),
+    known: wp.array(dtype=wp.float32),
+    shares: wp.array(dtype=wp.float32),
+):
+    leaf = first + wp.tid()
+    share = settings.exploration
+    if origins[leaf] >= 0:
+        share = known[origins[leaf]]
+        if discoveries[leaf] > 0:
+            share = share * 2.0
+        elif samples.counts[leaf] > 0:
+            share = share * 0.75
+    shares[leaf] = wp.clamp(share, settings.least_exploration, settings.exploration)

@@ -1,0 +1,152 @@
+"""The samples that paths leave behind, one at each vertex, and the regions (octree leaves) that they are learnt in.
+
+Every path that is recorded owns the slots of its vertices, so that nothing depends on the order of threads. Of paths
+beyond what the buffers are for, one in `stride` is recorded, whichever a hash says.
+"""
+
+import warp as wp
+
+from warp_gi.kernels.emitters import LightChoice
+from warp_gi.kernels.gbuffer import previous_position
+from warp_gi.kernels.octree import EMPTY_CODE, Octree, cell_code, octree_leaf
+from warp_gi.kernels.path_samplers import DirectionSample, Regions
+from warp_gi.kernels.quadtree_adapt import quadtree_pack_direction
+from warp_gi.kernels.sampling import hash_uint
+from warp_gi.kernels.surface import Surface
+from warp_gi.kernels.types import SceneData
+
+wp.set_module_options({"enable_backward": False})
+
+LIGHT_VISIBLE = wp.constant(wp.uint32(1 << 31))
+LIGHT_NEW = wp.constant(wp.uint32(1 << 30))  # selected by exploration, and unknown to the region
+SURFACE_GLOSSY = wp.constant(wp.uint32(1 << 29))
+LIGHT_ITEM = wp.constant(wp.uint32((1 << 28) - 1))  # emitter + 1; 0: none was sampled
+GLOSSY_ALPHA = wp.constant(wp.float32(0.2))  # GGX alpha below which a surface counts as glossy
+NO_DIRECTION = wp.constant(wp.float32(-1.0))
+
+
+# Samples by slot.
+@wp.struct
+class SampleRecords:
+    codes: wp.array(dtype=wp.uint32)  # octree cell of the point; EMPTY_CODE: no sample
+    lights: wp.array(dtype=wp.uint32)  # LIGHT_*
+    directions: wp.array(dtype=wp.uint32)  # quadtree_pack_direction
+    contributions: wp.array(dtype=wp.float32)  # luminance that came to the picture that way, but for emitters it hit
+    mixtures: wp.array(dtype=wp.uint32)  # share of the BSDF in the density there (16 bits), and of asking it (<< 16)
+    vertices: wp.int32  # slots of a path
+    stride: wp.int32
+    seed: wp.uint32
+
+
+@wp.struct
+class SampleRegions:
+    octree: Octree
+    records: SampleRecords
+    moves: wp.int32  # 1: points may have been elsewhere in the previous frame
+
+
+# Leaf of what was learnt about a point: at its place in the previous frame, from which the samples are.
+@wp.func
+def sample_region(
+    data: SampleRegions, scene: SceneData, s: Surface, face: wp.int32, u: wp.float32, v: wp.float32
+) -> wp.int32:
+    position = s.position
+    if data.moves != 0:
+        position = previous_position(scene.geometry, face, u, v)
+    return octree_leaf(data.octree.nodes, cell_code(data.octree, position))
+
+
+@wp.func
+def sample_slot(data: SampleRegions, path: wp.int32) -> wp.int32:
+    group = path / data.records.stride
+    turn = wp.int32(hash_uint(wp.uint32(group) ^ data.records.seed) % wp.uint32(data.records.stride))
+    if path - group * data.records.stride != turn:
+        return -1
+    return group * data.records.vertices
+
+
+@wp.func
+def keep_vertex(data: SampleRegions, slot: wp.int32, s: Surface):
+    data.records.codes[slot] = cell_code(data.octree, s.position)
+    flags = wp.uint32(0)
+    if s.bsdf.f90 > 0.0 and s.bsdf.alpha < GLOSSY_ALPHA:
+        flags = SURFACE_GLOSSY
+    data.records.lights[slot] = flags
+    data.records.contributions[slot] = NO_DIRECTION
+
+
+@wp.func
+def keep_light(data: SampleRegions, slot: wp.int32, choice: LightChoice, visible: wp.int32):
+    word = data.records.lights[slot] | wp.uint32(choice.item + 1)
+    if visible != 0:
+        word = word | LIGHT_VISIBLE
+    if choice.is_new != 0:
+        word = word | LIGHT_NEW
+    data.records.lights[slot] = word
+
+
+# `light` is what the path had gathered before; `keep_end` makes a difference of it.
+@wp.func
+def keep_direction(data: SampleRegions, slot: wp.int32, s: Surface, sample: DirectionSample, light: wp.float32):
+    data.records.directions[slot] = quadtree_pack_direction(sample.wi)
+    posterior = wp.clamp(sample.bsdf_share * sample.bsdf_pdf / sample.pdf, 0.0, 1.0)
+    share = wp.uint32(sample.bsdf_share * 65535.0 + 0.5)
+    data.records.mixtures[slot] = wp.uint32(posterior * 65535.0 + 0.5) | (share << wp.uint32(16))
+    data.records.contributions[slot] = light
+
+
+@wp.func
+def keep_end(data: SampleRegions, slot: wp.int32, vertices: wp.int32, light: wp.float32):
+    for vertex in range(vertices):
+        before = data.records.contributions[slot + vertex]
+        if before >= 0.0:
+            data.records.contributions[slot + vertex] = wp.max(light - before, 0.0)
+
+
+SAMPLE_REGIONS = Regions(
+    "octree",
+    SampleRegions,
+    sample_region,
+    sample_slot,
+    keep_vertex,
+    keep_light,
+    keep_direction,
+    keep_end,
+)
+
+CHUNK = wp.constant(1024)  # slots that one thread compacts
+
+
+# Thread: a chunk of slots. Counts its samples.
+@wp.kernel
+def count_samples(first: wp.int32, records: SampleRecords, counts: wp.array(dtype=wp.int32)):
+    chunk = first + wp.tid()
+    end = wp.min((chunk + 1) * CHUNK, records.codes.shape[0])
+    count = int(0)
+    for slot in range(chunk * CHUNK, end):
+        if records.codes[slot] != EMPTY_CODE:
+            count += 1
+    counts[chunk] = count
+
+
+# Thread: a chunk of slots. Lists its samples, codes and slots, after those of the chunks before (`ends`: their
+# running sum).
+@wp.kernel
+def list_samples(
+    first: wp.int32,
+    records: SampleRecords,
+    ends: wp.array(dtype=wp.int32),
+    codes: wp.array(dtype=wp.int32),
+    slots: wp.array(dtype=wp.int32),
+):
+    chunk = first + wp.tid()
+    end = wp.min((chunk + 1) * CHUNK, records.codes.shape[0])
+    place = int(0)
+    if chunk > 0:
+        place = ends[chunk - 1]
+    for slot in range(chunk * CHUNK, end):
+        code = records.codes[slot]
+        if code != EMPTY_CODE:
+            codes[place] = wp.int32(code)
+            slots[place] = slot
+            place += 1

@@ -1,0 +1,808 @@
+"""Directional quadtrees against a decoder that knows cells only: bits, migration, both samplers, adaptation."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from functools import cache
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.stats import qmc
+from statistics_tools import chi_squared, device, every_device, sphere_expectation, sphere_histogram  # noqa: F401
+
+from warp_gi.kernels import octahedral, quadtree, quadtree_adapt, sampling
+from warp_gi.launch import launch, set_threads
+
+wp.set_module_options({"enable_backward": False})
+
+SIZES = (32, 64, 96, 128)
+LEVELS = int(quadtree.QUADTREE_LEVELS)
+
+
+# ---- kernels: a thread is a tree, or a point of one tree ----
+
+
+# What a tree answers about its nodes.
+@wp.kernel
+def ask_nodes(
+    first: wp.int32,
+    bits: wp.int32,
+    trees: wp.array(dtype=wp.vec4ui),
+    ranks: wp.array2d(dtype=wp.uint8),
+    twigs: wp.array2d(dtype=wp.uint8),
+    selected: wp.array2d(dtype=wp.uint8),
+    places: wp.array2d(dtype=wp.uint32),
+):
+    i = first + wp.tid()
+    tree = trees[i]
+    inner = bits / 4 - 1
+    for k in range(bits):
+        ranks[i, k] = wp.uint8(quadtree.quadtree_rank(tree, k))
+        twigs[i, k] = wp.uint8(quadtree.quadtree_is_twig(tree, k))
+        cell = quadtree.quadtree_bounds(tree, bits, k)
+        # 2^level + column and 2^level + row, which say the level too
+        column = wp.uint32((1.0 + cell.x) / cell.size)
+        row = wp.uint32((1.0 + cell.y) / cell.size)
+        places[i, k] = (column << wp.uint32(16)) | row
+        if k < inner:
+            selected[i, k] = wp.uint8(quadtree.quadtree_select1(tree, k))
+        else:
+            selected[i, k] = wp.uint8(quadtree.quadtree_select0(tree, bits, k - inner))
+
+
+# How many leaves are found by a point in the middle and by points in the four corners.
+@wp.kernel
+def locate_leaves(first: wp.int32, bits: wp.int32, trees: wp.array(dtype=wp.vec4ui), found: wp.array(dtype=wp.int32)):
+    i = first + wp.tid()
+    count = int(0)
+    for leaf in range(quadtree.quadtree_leaf_count(bits)):
+        node = quadtree.quadtree_select0(trees[i], bits, leaf)
+        cell = quadtree.quadtree_bounds(trees[i], bits, node)
+        last = cell.size - 5.9604644775390625e-8
+        for corner in range(5):
+            x = cell.x + wp.where(corner == 4, 0.5 * cell.size, wp.where((corner & 1) == 1, last, 0.0))
+            y = cell.y + wp.where(corner == 4, 0.5 * cell.size, wp.where((corner & 2) == 2, last, 0.0))
+            other = quadtree.quadtree_locate(trees[i], bits, wp.vec2(x, y))
+            if other.node == node and other.x == cell.x and other.y == cell.y and other.size == cell.size:
+                count += 1
+    found[i] = count
+
+
+@wp.kernel
+def find_level_starts(
+    first: wp.int32, bits: wp.int32, trees: wp.array(dtype=wp.vec4ui), starts: wp.array2d(dtype=wp.int32)
+):
+    i = first + wp.tid()
+    for level in range(starts.shape[1]):
+        starts[i, level] = quadtree.quadtree_level_start(trees[i], bits, level + 1)
+
+
+@wp.kernel
+def halve_words(
+    first: wp.int32, words: wp.array(dtype=wp.uint64), i: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)
+):
+    k = first + wp.tid()
+    out[k] = quadtree.select_by_halves(words[k], i[k])
+
+
+# Migrates random leaves and writes every tree, with the nodes that were migrated to get it (none: -1).
+@wp.kernel
+def walk(
+    first: wp.int32,
+    bits: wp.int32,
+    steps: wp.int32,
+    tree: wp.vec4ui,
+    trees: wp.array(dtype=wp.vec4ui),
+    moves: wp.array(dtype=wp.vec2i),
+):
+    i = first + wp.tid()
+    now = wp.vec4ui(tree)
+    for step in range(steps):
+        a = sampling.random_1d(wp.uint32(i * steps + step), wp.uint32(1), 0)
+        b = sampling.random_1d(wp.uint32(i * steps + step), wp.uint32(1), 1)
+        leaves = quadtree.quadtree_leaf_count(bits)
+        leaf = quadtree.quadtree_select0(now, bits, wp.int32(a * wp.float32(leaves)))
+        inner = quadtree.quadtree_select1(now, wp.int32(b * wp.float32(bits / 4 - 1)))
+        moves[i * steps + step] = wp.vec2i(-1, -1)
+        if (
+            quadtree.quadtree_is_twig(now, inner) != 0
+            and quadtree.quadtree_children(now, inner) != (leaf & ~3)
+            and leaf < quadtree.quadtree_level_start(now, bits, quadtree.QUADTREE_LEVELS)
+        ):
+            now = quadtree.quadtree_migrate(now, bits, leaf, inner)
+            moves[i * steps + step] = wp.vec2i(leaf, inner)
+        trees[i * steps + step] = now
+
+
+@wp.kernel
+def fill_counts(first: wp.int32, bits: wp.int32, trees: wp.array(dtype=wp.vec4ui), counts: wp.array(dtype=wp.uint32)):
+    i = first + wp.tid()
+    quadtree.quadtree_counts(trees[i], bits, counts, i * (bits / 4))
+
+
+# Points (x, y, level), directions and densities of both samplers, and the density of each direction.
+@wp.kernel
+def draw(
+    first: wp.int32,
+    bits: wp.int32,
+    tree: wp.vec4ui,
+    counts: wp.array(dtype=wp.uint32),
+    numbers: wp.array(dtype=wp.vec3),
+    points: wp.array2d(dtype=wp.vec3),
+    directions: wp.array2d(dtype=wp.vec3),
+    densities: wp.array2d(dtype=wp.vec2),
+):
+    i = first + wp.tid()
+    u2 = wp.vec2(numbers[i][0], numbers[i][1])
+    a = quadtree.quadtree_leaf_point(tree, bits, numbers[i][2], u2)
+    b = quadtree.quadtree_warp_point(tree, bits, counts, 0, u2)
+    points[0, i] = wp.vec3(a.uv[0], a.uv[1], wp.float32(a.level))
+    points[1, i] = wp.vec3(b.uv[0], b.uv[1], wp.float32(b.level))
+    c = quadtree.quadtree_sample_leaf(tree, bits, numbers[i][2], u2)
+    d = quadtree.quadtree_sample_warp(tree, bits, counts, 0, u2)
+    directions[0, i] = c.direction
+    directions[1, i] = d.direction
+    densities[0, i] = wp.vec2(c.pdf, quadtree.quadtree_pdf(tree, bits, c.direction))
+    densities[1, i] = wp.vec2(d.pdf, quadtree.quadtree_pdf(tree, bits, d.direction))
+
+
+@wp.kernel
+def evaluate(
+    first: wp.int32,
+    bits: wp.int32,
+    tree: wp.vec4ui,
+    directions: wp.array(dtype=wp.vec3),
+    pdf: wp.array(dtype=wp.float32),
+    density: wp.array(dtype=wp.float32),
+    packed: wp.array(dtype=wp.uint32),
+    uvs: wp.array(dtype=wp.vec2),
+):
+    i = first + wp.tid()
+    pdf[i] = quadtree.quadtree_pdf(tree, bits, directions[i])
+    density[i] = quadtree.octahedral_density(directions[i])
+    packed[i] = quadtree_adapt.quadtree_pack_direction(directions[i])
+    uvs[i] = octahedral.octahedral_encode(directions[i])
+
+
+# ---- oracle: a tree is the set of its inner cells (level, column, row), of which (0, 0, 0) is always one ----
+
+
+def children(cell):
+    level, x, y = cell
+    return [(level + 1, 2 * x + (q & 1), 2 * y + (q >> 1)) for q in range(4)]
+
+
+def encoded(inner):
+    """The tree as a number, and its nodes' cells in breadth-first order."""
+    cells, number = [], 0
+    queue = [(0, 0, 0)]
+    while queue:
+        following = []
+        for cell in queue:
+            for child in children(cell):
+                if child in inner:
+                    number |= 1 << len(cells)
+                    following.append(child)
+                cells.append(child)
+        queue = following
+    return number, cells
+
+
+def decoded(number, bits):
+    """The cells of a tree's nodes, and the set of its inner cells."""
+    cells, inner = children((0, 0, 0)), {(0, 0, 0)}
+    for k in range(bits):
+        if number >> k & 1:
+            inner.add(cells[k])
+            cells += children(cells[k])
+    assert len(cells) == bits and number >> bits == 0
+    return cells, inner
+
+
+def words(numbers):
+    """Trees as an array [tree] of four 32-bit words."""
+    values = [[number >> (32 * w) & 0xFFFFFFFF for w in range(4)] for number in numbers]
+    return np.array(values, np.uint32).reshape(-1, 4)
+
+
+def number_of(four):
+    return sum(int(word) << (32 * i) for i, word in enumerate(four))
+
+
+@cache
+def random_trees(bits, count, deepest=8, seed=1):
+    """Trees that grew by splitting random leaves, some towards a point, as numbers."""
+    rng = np.random.default_rng([bits, seed])
+    numbers = []
+    for i in range(count):
+        inner, leaves = {(0, 0, 0)}, children((0, 0, 0))
+        target = rng.random(2)
+        while len(inner) < bits // 4:
+            near = [
+                k
+                for k, (level, x, y) in enumerate(leaves)
+                if level < deepest and (x, y) == tuple((target * 2**level).astype(int))
+            ]
+            k = near[0] if near and i % 2 and rng.random() < 0.4 else int(rng.integers(len(leaves)))
+            if leaves[k][0] < deepest:
+                inner.add(leaves[k])
+                leaves += children(leaves.pop(k))
+        numbers.append(encoded(inner)[0])
+    return numbers
+
+
+def bit_matrix(trees, bits):
+    """Bits uint8 [tree, node] of trees [tree, 4]."""
+    return np.unpackbits(trees.view(np.uint8), axis=1, bitorder="little")[:, :bits]
+
+
+def are_valid(trees, bits):
+    """Whether each tree has as many inner nodes as it must, each of which is a child of one before it."""
+    ones = bit_matrix(trees, bits).astype(np.int32)
+    before = np.cumsum(ones, axis=1) - ones
+    right = (ones.sum(axis=1) == bits // 4 - 1) & (np.arange(bits) < 4 * (before + 1)).all(axis=1)
+    return right & ~trees[:, bits // 32 :].any(axis=1)
+
+
+@cache
+def all_trees():
+    """All quadtrees of 32 bits: inner node j, not counting the root, is one of the first 4 (j + 1) nodes."""
+    last, numbers = np.array([-1]), np.array([0], np.uint64)
+    for j in range(7):
+        grown = [(np.full(1, 0), np.full(1, 0, np.uint64))][:0]
+        for place in range(4 * (j + 1)):
+            chosen = last < place
+            grown.append((np.full(chosen.sum(), place), numbers[chosen] | np.uint64(1 << place)))
+        last, numbers = (np.concatenate(parts) for parts in zip(*grown, strict=True))
+    return np.stack([numbers.astype(np.uint32), *3 * [np.zeros(len(numbers), np.uint32)]], axis=1)
+
+
+def preimages(number, bits):
+    """Of each leaf's cell the rectangle (x0, x1, y0, y1) that quadtree_warp_point maps to it, exactly."""
+    _, inner = decoded(number, bits)
+
+    @cache
+    def leaves_below(cell):
+        return sum(map(leaves_below, children(cell))) if cell in inner else 1
+
+    rectangles = {}
+
+    def divide(cell, x0, x1, y0, y1):
+        if cell not in inner:
+            rectangles[cell] = (x0, x1, y0, y1)
+            return
+        four = children(cell)
+        n = [leaves_below(child) for child in four]
+        x = x0 + (x1 - x0) * Fraction(n[0] + n[2], sum(n))
+        for side, (left, right) in enumerate([(x0, x), (x, x1)]):
+            y = y0 + (y1 - y0) * Fraction(n[side], n[side] + n[side + 2])
+            divide(four[side], left, right, y0, y)
+            divide(four[side + 2], left, right, y, y1)
+
+    divide((0, 0, 0), Fraction(0), Fraction(1), Fraction(0), Fraction(1))
+    return rectangles
+
+
+def migrated(number, bits, leaf, inner_node):
+    cells, inner = decoded(number, bits)
+    return encoded(inner - {cells[inner_node]} | {cells[leaf]})
+
+
+def adapted(number, bits, uvs, contributions, migrations, significance):
+    """The tree after one frame, by cells; energies in float64."""
+    cells, inner = decoded(number, bits)
+    energies = {cell: np.zeros(4) for cell in cells if cell not in inner}
+    for (x, y), contribution in zip(uvs, contributions, strict=True):
+        cell = (0, 0, 0)
+        while cell in inner:
+            level = cell[0] + 1
+            cell = (level, int(x * 2**level), int(y * 2**level))
+        level = cell[0] + 1
+        energies[cell][int(x * 2**level) % 2 + 2 * (int(y * 2**level) % 2)] += max(contribution, 0.0) ** 2
+    for _ in range(migrations):
+        cells = encoded(inner)[1]
+        leaves = [c for c in cells if c not in inner and c[0] < LEVELS]
+        leaf = max(leaves, key=lambda c: energies[c].sum())
+        twigs = [c for c in cells if c in inner and not set(children(c)) & inner and leaf not in children(c)]
+        twig = min(twigs, key=lambda c: sum(energies[child].sum() for child in children(c)))
+        if not energies[leaf].sum() * significance > sum(energies[child].sum() for child in children(twig)):
+            break
+        energies[twig] = np.array([energies.pop(child).sum() for child in children(twig)])
+        for child, energy in zip(children(leaf), energies.pop(leaf), strict=True):
+            energies[child] = np.full(4, energy / 4)
+        inner = inner - {twig} | {leaf}
+    return encoded(inner)[0]
+
+
+def oracle_density(directions):
+    """Of the octahedral map, 1 / |(d direction / du) x (d direction / dv)|, by differences in float64."""
+    d = np.asarray(directions, np.float64)
+    q = d / np.abs(d).sum(axis=-1, keepdims=True)
+    lower = q[:, 1] < 0
+    x = np.where(lower, np.where(q[:, 0] < 0, -1, 1) * (1 - np.abs(q[:, 2])), q[:, 0])
+    z = np.where(lower, np.where(q[:, 2] < 0, -1, 1) * (1 - np.abs(q[:, 0])), q[:, 2])
+
+    def direction(u, v):
+        x, z = 2 * u - 1, 2 * v - 1
+        y = 1 - np.abs(x) - np.abs(z)
+        fold = np.maximum(-y, 0)
+        p = np.stack([x - np.sign(x) * fold, y, z - np.sign(z) * fold], axis=-1)
+        return p / np.linalg.norm(p, axis=-1, keepdims=True)
+
+    u, v, h = (x + 1) / 2, (z + 1) / 2, 1e-6
+    du = (direction(u + h, v) - direction(u - h, v)) / (2 * h)
+    dv = (direction(u, v + h) - direction(u, v - h)) / (2 * h)
+    return 1 / np.linalg.norm(np.cross(du, dv), axis=-1)
+
+
+# ---- the kernels on arrays ----
+
+
+def on_device(values, dtype):
+    return wp.array(values, dtype=dtype, device=device())
+
+
+def empty(shape, dtype):
+    return wp.zeros(shape, dtype=dtype, device=device())
+
+
+def counts_of(trees, bits):
+    counts = empty(len(trees) * bits // 4, wp.uint32)
+    launch(fill_counts, len(trees), [bits, on_device(trees, wp.vec4ui), counts], device())
+    return counts
+
+
+def drawn(number, bits, numbers):
+    """Points, directions [sampler, i, 3] and densities [sampler, i, 2] of numbers [i, 3]."""
+    tree = words([number])
+    shape = (2, len(numbers))
+    points, directions, densities = (empty(shape, t) for t in (wp.vec3, wp.vec3, wp.vec2))
+    inputs = [bits, wp.vec4ui(*map(int, tree[0])), counts_of(tree, bits), on_device(numbers, wp.vec3)]
+    launch(draw, len(numbers), [*inputs, points, directions, densities], device())
+    return points.numpy(), directions.numpy(), densities.numpy()
+
+
+def evaluated(number, bits, directions):
+    """pdf, octahedral_density, packed directions and octahedral coordinates."""
+    n = len(directions)
+    outputs = [empty(n, t) for t in (wp.float32, wp.float32, wp.uint32, wp.vec2)]
+    tree = wp.vec4ui(*map(int, words([number])[0]))
+    launch(evaluate, n, [bits, tree, on_device(directions, wp.vec3), *outputs], device())
+    return [output.numpy() for output in outputs]
+
+
+def walked(bits, threads, steps):
+    """Trees [thread, step, 4] and moves [thread, step, 2]."""
+    trees, moves = empty(threads * steps, wp.vec4ui), empty(threads * steps, wp.vec2i)
+    start = wp.vec4ui(*quadtree.quadtree_uniform(bits))
+    launch(walk, threads, [bits, steps, start, trees, moves], device(), 1)
+    return trees.numpy().reshape(threads, steps, 4), moves.numpy().reshape(threads, steps, 2)
+
+
+def adapt(trees, bits, records, migrations=1, most_samples=1 << 30, significance=0.1):
+    """Trees [leaf, 4] and counts after one frame; ``records`` is [leaf] of (packed directions, contributions)."""
+    lengths = np.array([len(packed) for packed, _ in records], np.int32)
+    total = int(lengths.sum())
+    order = np.random.default_rng(3).permutation(total).astype(np.int32)
+    packed, contributions = np.zeros(total + 1, np.uint32), np.zeros(total + 1, np.float32)
+    packed[order] = np.concatenate([packed for packed, _ in records])
+    contributions[order] = np.concatenate([contributions for _, contributions in records])
+    samples = quadtree_adapt.QuadtreeSamples()
+    samples.starts = on_device((np.cumsum(lengths) - lengths).astype(np.int32), wp.int32)
+    samples.counts = on_device(lengths, wp.int32)
+    samples.order = on_device(np.append(order, 0), wp.int32)
+    samples.directions = on_device(packed, wp.uint32)
+    samples.contributions = on_device(contributions, wp.float32)
+    adaptation = quadtree_adapt.QuadtreeAdaptation()
+    adaptation.bits, adaptation.migrations = bits, migrations
+    adaptation.significance, adaptation.most_samples = significance, most_samples
+    adaptation.trees = on_device(trees, wp.vec4ui)
+    adaptation.counts = empty(len(trees) * bits // 4, wp.uint32)
+    # scratch: what is left there from before must not matter
+    adaptation.energies = on_device(np.full(len(trees) * 4 * bits, 1e30, np.float32), wp.float32)
+    launch(quadtree_adapt.adapt_quadtrees, len(trees), [samples, adaptation], device(), 1)
+    return adaptation.trees.numpy(), adaptation.counts.numpy()
+
+
+def uv_of(packed):
+    return np.stack([packed & 0xFFFF, packed >> 16], axis=-1) / 65536.0
+
+
+def packed_of(uvs):
+    x, y = (np.asarray(uvs) * 65536).astype(np.uint32).T
+    return x | y << 16
+
+
+def leaf_masses(number, bits, packed, weights):
+    """Sums of the weights of packed directions over leaves, by cell: intervals of Morton codes."""
+    cells, inner = decoded(number, bits)
+
+    def morton(x, y):
+        return sum((x >> i & 1) << 2 * i | (y >> i & 1) << 2 * i + 1 for i in range(16))
+
+    codes = morton((packed & 0xFFFF).astype(np.int64), (packed >> 16).astype(np.int64))
+    order = np.argsort(codes)
+    sums = np.append(0, np.cumsum(weights[order], dtype=np.float64))
+    leaves = [cell for cell in cells if cell not in inner]
+    starts = np.array([morton(x, y) << 2 * (16 - level) for level, x, y in leaves])
+    ends = starts + np.array([1 << 2 * (16 - level) for level, _, _ in leaves])
+    low, high = (np.searchsorted(codes[order], bounds) for bounds in (starts, ends))
+    return dict(zip(leaves, sums[high] - sums[low], strict=True))
+
+
+def level_grid(number, bits, deepest):
+    """Level of the leaf [row, column] of each cell of a grid of 2^deepest x 2^deepest."""
+    cells, inner = decoded(number, bits)
+    grid = np.zeros((2**deepest, 2**deepest), int)
+    for level, x, y in set(cells) - inner:
+        size = 2 ** (deepest - level)
+        grid[y * size : (y + 1) * size, x * size : (x + 1) * size] = level
+    return grid
+
+
+# ---- bits ----
+
+
+def check_nodes(trees, bits):
+    """Rank, select, twigs, bounds and locate of trees [tree, 4] against the bits themselves."""
+    n = len(trees)
+    ranks, twigs, selected = (empty((n, bits), wp.uint8) for _ in range(3))
+    places, found = empty((n, bits), wp.uint32), empty(n, wp.int32)
+    on = on_device(trees, wp.vec4ui)
+    launch(ask_nodes, n, [bits, on, ranks, twigs, selected, places], device())
+    launch(locate_leaves, n, [bits, on, found], device())
+    ones = bit_matrix(trees, bits)
+    before = np.cumsum(ones, axis=1, dtype=np.uint8) - ones
+    assert np.array_equal(ranks.numpy(), before)
+    inner, leaves = (np.nonzero(ones == bit)[1].reshape(n, -1) for bit in (1, 0))
+    assert np.array_equal(selected.numpy(), np.concatenate([inner, leaves], axis=1))
+    assert (found.numpy() == 5 * leaves.shape[1]).all()
+    # children of inner node j are nodes 4 j ..: what a node is, is known once its parent is
+    expected = np.zeros((n, bits + 1), np.uint32)
+    expected[:, bits] = 1 << 16 | 1  # the root
+    expected_twigs = np.zeros((n, bits), bool)
+    rows = np.arange(n)
+    for j in range(bits // 4):
+        parent = np.full(n, bits) if j == 0 else inner[:, j - 1]
+        for q in range(4):
+            expected[:, 4 * j + q] = 2 * expected[rows, parent] + ((q & 1) << 16 | q >> 1)
+        if j:
+            expected_twigs[rows, parent] = ~ones[:, 4 * j : 4 * j + 4].any(axis=1)
+    assert np.array_equal(twigs.numpy(), expected_twigs)
+    assert np.array_equal(places.numpy(), expected[:, :bits])
+
+
+def test_every_tree_of_32_bits():
+    trees = all_trees()
+    assert len(trees) == 420_732  # binomial(32, 8) / 25
+    assert are_valid(trees, 32).all() and len(np.unique(trees[:, 0])) == len(trees)
+    for part in np.array_split(trees, 100):
+        check_nodes(part, 32)
+
+
+@pytest.mark.parametrize("bits", SIZES)
+def test_random_trees(bits):
+    numbers = random_trees(bits, 200)
+    trees = words(numbers)
+    assert are_valid(trees, bits).all()
+    check_nodes(trees, bits)
+    starts = empty((len(trees), 14), wp.int32)
+    launch(find_level_starts, len(trees), [bits, on_device(trees, wp.vec4ui), starts], device())
+    counts = counts_of(trees, bits).numpy().reshape(len(trees), bits // 4)
+    for number, levels, packed in zip(numbers, starts.numpy(), counts, strict=True):
+        cells, inner = decoded(number, bits)
+        assert encoded(inner) == (number, cells)
+        assert levels.tolist() == [sum(cell[0] < level for cell in cells) for level in range(1, 15)]
+        leaves = [cell for cell in cells if cell not in inner]
+        below = [
+            sum(
+                leaf[1] >> (leaf[0] - level) == x and leaf[2] >> (leaf[0] - level) == y
+                for leaf in leaves
+                if leaf[0] >= level
+            )
+            for level, x, y in cells
+        ]
+        assert packed.view(np.uint8).tolist() == below
+
+
+def test_select_without_an_instruction():
+    rng = np.random.default_rng(1)
+    values = rng.integers(1, 1 << 64, 20_000, dtype=np.uint64) & rng.integers(1, 1 << 64, 20_000, dtype=np.uint64)
+    values[:3] = 1, 1 << 63, (1 << 64) - 1
+    bits = np.unpackbits(values[:, None].view(np.uint8), axis=1, bitorder="little")
+    values, bits = values[bits.any(axis=1)], bits[bits.any(axis=1)]
+    i = (rng.random(len(values)) * bits.sum(axis=1)).astype(np.int32)
+    out = empty(len(values), wp.int32)
+    launch(halve_words, len(values), [on_device(values, wp.uint64), on_device(i, wp.int32), out], device())
+    assert np.array_equal(out.numpy(), np.argmax(np.cumsum(bits, axis=1) > i[:, None], axis=1))
+
+
+@pytest.mark.parametrize("bits", SIZES)
+def test_uniform_tree(bits):
+    cells, inner = decoded(number_of(quadtree.quadtree_uniform(bits)), bits)
+    levels = [cell[0] for cell in cells if cell not in inner]
+    assert len(levels) == 3 * bits // 4 + 1 and max(levels) - min(levels) <= 1
+    with pytest.raises(ValueError, match="33"):
+        quadtree.quadtree_uniform(33)
+
+
+# ---- migration ----
+
+
+@pytest.mark.parametrize("bits", SIZES)
+def test_migrations(bits):
+    """Half a million steps keep trees valid; each is what moving cells in a decoded tree and encoding that gives."""
+    threads, steps = 256, 2000  # a third of the steps find a twig and a leaf
+    trees, moves = walked(bits, threads, steps)
+    assert (moves[..., 0] >= 0).sum() > 125_000
+    for part in trees.reshape(16, -1, 4):
+        assert are_valid(part, bits).all()
+    reached = 0
+    for thread in range(3):
+        number = number_of(quadtree.quadtree_uniform(bits))
+        for tree, (leaf, inner) in zip(trees[thread, :500], moves[thread, :500], strict=True):
+            if leaf >= 0:
+                number, cells = migrated(number, bits, int(leaf), int(inner))
+                reached = max(reached, cells[-1][0])  # the last node is on the deepest level
+            assert number_of(tree) == number
+    assert 4 <= reached <= LEVELS
+    check_nodes(trees[:, -1], bits)
+
+
+def test_a_walk_meets_known_trees_only():
+    trees, _ = walked(32, 256, 4000)
+    met = np.unique(trees[..., 0])
+    assert np.isin(met, all_trees()[:, 0]).all() and len(met) > 100_000
+
+
+# ---- density ----
+
+
+def random_directions(count, seed=1):
+    d = np.random.default_rng(seed).standard_normal((count, 3))
+    return (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32)
+
+
+def test_density_is_the_jacobian():
+    directions = random_directions(5000)
+    _, density, _, _ = evaluated(random_trees(64, 2)[0], 64, directions)
+    expected = oracle_density(directions)
+    smooth = np.abs(directions).min(axis=1) > 1e-4  # differences do not cross a fold
+    assert np.allclose(density[smooth], expected[smooth], rtol=2e-5) and smooth.mean() > 0.99
+    assert np.allclose(evaluated(0xF, 32, 7 * directions)[1], density, rtol=1e-5)  # of any length
+    # uniform directions have density 1 / (4 pi): its mean over them is that of 1 / area in the square
+    assert np.isclose((1 / density).mean() / (4 * np.pi), np.mean(1 / (4 * np.pi * expected)), rtol=1e-5)
+
+
+@pytest.mark.parametrize("bits", SIZES)
+def test_pdf(bits):
+    """The pdf is that of the leaf's cell, and integrates to one over the sphere."""
+    rows, columns = 500, 1000
+    z, phi = np.meshgrid(1 - (2 * np.arange(rows) + 1) / rows, 2 * np.pi * (np.arange(columns) + 0.5) / columns)
+    ring = np.sqrt(1 - z * z)
+    directions = np.stack([ring * np.cos(phi), z, ring * np.sin(phi)], axis=-1).reshape(-1, 3).astype(np.float32)
+    for number in random_trees(bits, 6, 6, seed=2):
+        pdf, density, _, uvs = evaluated(number, bits, directions)
+        column, row = np.minimum((uvs * 64).astype(int), 63).T
+        expected = 4.0 ** level_grid(number, bits, 6)[row, column] / (3 * bits / 4 + 1)
+        assert np.allclose(pdf, expected * density, rtol=1e-5)
+        assert abs(pdf.mean() * 4 * np.pi - 1) < 0.01
+    poles = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
+    assert (evaluated(number, bits, poles)[0] > 0).all()
+
+
+# ---- samplers ----
+
+
+@pytest.mark.parametrize("bits", SIZES)
+def test_samplers_follow_the_pdf(bits):
+    rng = np.random.default_rng(bits)
+    for number in random_trees(bits, 2, 5, seed=3):
+        numbers = rng.random((100_000, 3), dtype=np.float32)
+        points, directions, densities = drawn(number, bits, numbers)
+        expected = sphere_expectation(lambda d, n=number: evaluated(n, bits, d)[0], len(numbers), 24, 24, 24)
+        assert np.isclose(expected.sum(), len(numbers), rtol=3e-3)
+        cells, inner = decoded(number, bits)
+        leaves = np.array(sorted(set(cells) - inner))
+        for sampler in range(2):
+            assert np.abs(np.linalg.norm(directions[sampler], axis=1) - 1).max() < 1e-6
+            assert chi_squared(sphere_histogram(directions[sampler], 24, 24), expected) > 1e-3
+            # a grid of 4 x 4 in each leaf
+            level = points[sampler, :, 2].astype(int)
+            scaled = points[sampler, :, :2] * 2.0 ** level[:, None]
+            keys = (level << 24) + scaled.astype(int) @ [1 << 12, 1]
+            known = leaves @ [1 << 24, 1 << 12, 1]
+            assert np.isin(keys, known).all()
+            fourths = np.searchsorted(known, keys) * 16 + (scaled % 1 * 4).astype(int) @ [1, 4]
+            counts = np.bincount(fourths, minlength=16 * len(leaves))
+            assert chi_squared(counts, np.full(len(counts), len(numbers) / len(counts))) > 1e-3
+            # rounding moves a direction over the border of its leaf, rarely
+            pdf, again = densities[sampler].T
+            same = np.isclose(pdf, again, rtol=1e-5)
+            edge = points[sampler, :, :2] * 2.0 ** points[sampler, :, 2:]
+            assert same[(np.abs(edge - np.round(edge)) > 1e-4).all(axis=1)].all() and same.mean() > 0.999
+
+
+@pytest.mark.parametrize("bits", SIZES)
+def test_warp_stretches_equal_areas_over_leaves(bits):
+    """Each leaf's rectangle has area 1 / leaves exactly, and its points keep their place in it."""
+    inside = np.array([0.001, 0.2, 0.5, 0.7, 0.999])
+    grid = np.stack(np.meshgrid(inside, inside), axis=-1).reshape(-1, 2)
+    for number in random_trees(bits, 6, 12, seed=4):
+        rectangles = preimages(number, bits)
+        leaves = 3 * bits // 4 + 1
+        assert len(rectangles) == leaves
+        assert all((x1 - x0) * (y1 - y0) == Fraction(1, leaves) for x0, x1, y0, y1 in rectangles.values())
+        corners = np.array([[float(v) for v in rectangle] for rectangle in rectangles.values()])
+        lower, upper = corners[:, None, [0, 2]], corners[:, None, [1, 3]]
+        numbers = np.zeros((leaves * len(grid), 3))
+        numbers[:, :2] = (lower + grid * (upper - lower)).reshape(-1, 2)
+        points = drawn(number, bits, numbers)[0][1].astype(np.float64)
+        level, *place = np.array(list(rectangles)).T
+        assert np.array_equal(points[:, 2], np.repeat(level, len(grid)))
+        relative = points[:, :2] * 2.0 ** points[:, 2:] - np.repeat(np.stack(place, axis=-1), len(grid), axis=0)
+        width = (upper - lower).min()
+        assert np.abs(relative - np.tile(grid, (leaves, 1))).max() < 1e-3 + 1e-6 / width
+        assert ((relative > 0) & (relative < 1)).all()
+
+
+@pytest.mark.parametrize("bits", SIZES)
+def test_warp_is_monotone_and_stays_inside(bits):
+    """With one number fixed the point follows the other, also one rounding step beside every border."""
+    last = np.float32(1) - np.float32(2.0**-24)
+    for number in random_trees(bits, 4, 12, seed=5):
+        borders = np.array(
+            [[float(v) for v in rectangle] for rectangle in preimages(number, bits).values()], np.float32
+        )
+        for axis in range(2):
+            values = np.unique(borders[:, 2 * axis : 2 * axis + 2])
+            steps = [np.nextafter(values, np.float32(side)) for side in (-1, 2)]
+            values = np.concatenate([values, *steps, [0, 1e-40, last], np.linspace(0, last, 400, dtype=np.float32)])
+            values = np.unique(np.clip(values, 0, last)).astype(np.float32)
+            for fixed in (0, 0.123, 0.5, 0.77, last):
+                numbers = np.full((len(values), 3), fixed, np.float32)
+                numbers[:, axis] = values
+                numbers[:, 2] = values
+                points, _, densities = drawn(number, bits, numbers)
+                assert points[:, :, :2].min() >= 0 and points[:, :, :2].max() < 1
+                assert (np.diff(points[1, :, axis]) >= 0).all()
+                assert points[1, 0, axis] == 0 and points[1, -1, axis] > 1 - 2.0**-9
+                assert np.isfinite(densities).all() and (densities > 0).all()
+                cells, inner = decoded(number, bits)
+                leaves = set(cells) - inner
+                for sampler in range(2):  # rounding within the leaf does not leave it
+                    for x, y, level in points[sampler]:
+                        assert (int(level), int(x * 2.0**level), int(y * 2.0**level)) in leaves
+
+
+@pytest.mark.parametrize("bits", SIZES)
+def test_warp_keeps_points_stratified(bits):
+    """Of 1024 points of a (0, 2)-net each half of the root gets its share within one point, as any interval does;
+    leaves, whose rectangles are no elementary intervals, within 5, and with a tenth of the variance of random ones."""
+    count, leaves = 1024, 3 * bits // 4 + 1
+    variances = []
+    for seed, number in enumerate(random_trees(bits, 8, 12, seed=6)):
+        numbers = np.zeros((count, 3))
+        numbers[:, :2] = np.minimum(qmc.Sobol(2, seed=seed).random(count), 1 - 2.0**-24)
+        points = drawn(number, bits, numbers)[0][1]
+        cells, inner = decoded(number, bits)
+        share = sum(x >> (level - 1) == 0 for level, x, _ in set(cells) - inner) / leaves
+        assert abs((points[:, 0] < 0.5).sum() - share * count) < 1
+        keys = [(int(level), int(x * 2.0**level), int(y * 2.0**level)) for x, y, level in points]
+        counts = np.array([keys.count(cell) for cell in set(cells) - inner])
+        assert counts.sum() == count and np.abs(counts - count / leaves).max() < 5
+        variances.append(np.mean((counts - count / leaves) ** 2))
+    assert np.mean(variances) < 0.1 * count / leaves
+
+
+# ---- adaptation ----
+
+
+def spot(count, seed=1, sharpness=300.0):
+    """Records of uniform directions: packed, and the light of a spot in a given direction."""
+    directions = random_directions(count, seed)
+    packed = evaluated(0xF, 32, directions)[2]
+    return packed, np.exp(sharpness * (directions @ np.array([0.6, 0.64, -0.48]) - 1)).astype(np.float32)
+
+
+def test_packed_directions():
+    directions = np.concatenate([random_directions(5000), np.eye(3), -np.eye(3)]).astype(np.float32)
+    _, _, packed, uvs = evaluated(0xF, 32, directions)
+    assert np.array_equal(packed, packed_of(np.minimum(uvs, 1 - 2.0**-17)))
+
+
+@pytest.mark.parametrize("bits", SIZES)
+@pytest.mark.parametrize("migrations, significance", [(1, 0.5), (8, 0.5), (8, 4.0)])
+def test_adaptation_is_that_of_the_oracle(bits, migrations, significance):
+    """Tree for tree. Contributions are small integers, so that energies are exact and ties are real."""
+    rng = np.random.default_rng(bits)
+    numbers, records, expected = random_trees(bits, 12, 12, seed=7), [], []
+    for i, number in enumerate(numbers):
+        n = int(rng.integers(1, 600))
+        uvs = rng.random((n, 2))
+        uvs[: n // 2] = np.clip(0.3 + 0.02 * (1 + i % 4) * rng.standard_normal((n // 2, 2)), 0, 1 - 1e-6)
+        contributions = rng.integers(-2, 6, n).astype(np.float32)
+        packed = packed_of(uvs)
+        records.append((packed, contributions))
+        taken = np.arange(n) if n <= 400 else np.arange(400) * n // 400
+        expected.append(adapted(number, bits, uv_of(packed[taken]), contributions[taken], migrations, significance))
+    trees, counts = adapt(words(numbers), bits, records, migrations, 400, significance)
+    assert [number_of(tree) for tree in trees] == expected
+    changed = [len(decoded(a, bits)[1] - decoded(b, bits)[1]) for a, b in zip(expected, numbers, strict=True)]
+    assert max(changed) == migrations or (migrations == 8 and max(changed) >= 4)
+    assert np.array_equal(counts, counts_of(trees, bits).numpy())
+
+
+@pytest.mark.parametrize("migrations", [1, 8])
+def test_a_spot_is_refined(migrations):
+    bits = 128
+    packed, light = spot(40_000)
+    weights = light.astype(np.float64) ** 2
+    tree = words([number_of(quadtree.quadtree_uniform(bits))])
+    brightest, before = [], decoded(number_of(tree[0]), bits)[1]
+    for frame in range(60):
+        tree, _ = adapt(tree, bits, [(packed, light)], migrations)
+        inner = decoded(number_of(tree[0]), bits)[1]
+        assert len(inner - before) <= migrations and (inner != before or frame > 10 // migrations)
+        before = inner
+        brightest.append(max(leaf_masses(number_of(tree[0]), bits, packed, weights).values()) / weights.sum())
+    assert (np.diff(brightest) <= 1e-6).all() or migrations > 1
+    assert brightest[-1] < 0.1 and brightest[-1] < brightest[0] / 3
+    # at the end no leaf has ten times as much as four leaves together that could be given up for it
+    masses = leaf_masses(number_of(tree[0]), bits, packed, weights)
+    twigs = [sum(masses[c] for c in children(cell)) for cell in inner if not set(children(cell)) & inner]
+    assert 0.1 * max(masses.values()) <= min(twigs) * (1 + 1e-5)
+    again, _ = adapt(tree, bits, [(packed, light)], migrations)
+    assert np.array_equal(again, tree)
+    # the density has gone to the spot
+    centre = np.array([[0.6, 0.64, -0.48]], np.float32)
+    uniform = number_of(quadtree.quadtree_uniform(bits))
+    assert evaluated(number_of(tree[0]), bits, centre)[0] > 8 * evaluated(uniform, bits, centre)[0]
+
+
+@pytest.mark.parametrize("bits", SIZES)
+def test_nothing_to_learn_changes_nothing(bits):
+    numbers = random_trees(bits, 4, 12, seed=8)
+    packed = packed_of(np.random.default_rng(1).random((50, 2)))
+    none = (packed[:0], np.zeros(0, np.float32))
+    rejected, dark = (packed, np.full(50, -1, np.float32)), (packed, np.zeros(50, np.float32))
+    trees, counts = adapt(words(numbers), bits, [none, rejected, dark, none], 8)
+    assert [number_of(tree) for tree in trees] == numbers
+    assert np.array_equal(counts, counts_of(trees, bits).numpy())
+
+
+def test_leaves_are_split_to_the_deepest_level_only():
+    tree = words([number_of(quadtree.quadtree_uniform(128))])
+    record = (packed_of([[0.7001, 0.2003]]), np.ones(1, np.float32))
+    levels = []
+    for _ in range(12):
+        tree, _ = adapt(tree, 128, [record])
+        levels.append(max(cell[0] for cell in decoded(number_of(tree[0]), 128)[0]))
+    assert levels == [min(4 + i, LEVELS) for i in range(12)]  # the leaf was on level 3
+
+
+def test_siblings_are_not_given_up_for_a_leaf():
+    """Not even with a significance above 1 and no other children to give up."""
+    chain = [encoded({(level, 0, 0) for level in range(8)})[0]]
+    trees, _ = adapt(words(chain), 32, [(packed_of([[0.0001, 0.0001]]), np.ones(1, np.float32))], 8, significance=4.0)
+    assert number_of(trees[0]) == chain[0]
+
+
+def test_adaptation_does_not_depend_on_threads():
+    rng = np.random.default_rng(1)
+    numbers = random_trees(64, 100, 12, seed=9)
+    records = [
+        (packed_of(rng.random((n, 2)) ** 2), rng.exponential(size=n).astype(np.float32) ** 4)
+        for n in rng.integers(0, 200, len(numbers))
+    ]
+    results = []
+    try:
+        for threads in (1, 2, 3):
+            set_threads(threads)
+            results.append(adapt(words(numbers), 64, records, 4))
+    finally:
+        set_threads(None)
+    assert not np.array_equal(results[0][0], words(numbers))
+    for trees, counts in results[1:]:
+        assert np.array_equal(trees, results[0][0]) and np.array_equal(counts, results[0][1])

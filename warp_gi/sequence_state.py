@@ -1,0 +1,65 @@
+"""What a sequence knows between two frames, as plain arrays: to be saved, and to go on from in another process.
+
+States are dataclasses and kernel structs of arrays. Only arrays are saved; all else, as sizes of the scene, comes from
+the state before the first frame, which is made anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_gi.launch import copied
+
+
+def state_arrays(state: Any, name: str = "") -> dict[str, np.ndarray]:
+    """Return every array in a state, by the names of the fields that lead to it, joined by dots."""
+    if isinstance(state, wp.array):
+        return {name: state.numpy()}
+    if isinstance(state, np.ndarray):
+        return {name: state}
+    found: dict[str, np.ndarray] = {}
+    for key, value in _parts(state):
+        found |= state_arrays(value, f"{name}.{key}" if name else key)
+    return found
+
+
+def with_arrays(state: Any, arrays: Mapping[str, np.ndarray], device: wp.Device, name: str = "") -> Any:
+    """Return a state like ``state`` with its arrays replaced by those of ``state_arrays``.
+
+    Raises KeyError where ``arrays`` lacks one, ValueError where its items do not fit.
+    """
+    if isinstance(state, wp.array):
+        return wp.array(arrays[name], dtype=state.dtype, device=device)
+    if isinstance(state, np.ndarray):
+        return arrays[name]
+    parts = {key: with_arrays(value, arrays, device, f"{name}.{key}" if name else key) for key, value in _parts(state)}
+    if isinstance(state, dict):
+        return parts
+    if is_dataclass(state):
+        return replace(state, **parts)
+    if _is_struct(state):
+        restored = copied(state, state._cls)
+        for key, value in parts.items():
+            setattr(restored, key, value)
+        return restored
+    return state
+
+
+def _parts(state: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(state, dict):
+        yield from state.items()
+    elif is_dataclass(state):
+        yield from (
+            (field.name, getattr(state, field.name)) for field in fields(state) if "derived" not in field.metadata
+        )
+    elif _is_struct(state):
+        yield from ((key, getattr(state, key)) for key in state._cls.vars)
+
+
+def _is_struct(value: Any) -> bool:
+    return hasattr(getattr(value, "_cls", None), "vars")

@@ -1,0 +1,134 @@
+"""Indirect light by paths that go where light came from: directional quadtrees (temporal_reuse.txt, section 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_gi import launch
+from warp_gi.errors import OptionError
+from warp_gi.estimator import SamplerInUse
+from warp_gi.kernels import guided_directions, guided_shares, quadtree, quadtree_adapt
+from warp_gi.techniques.baselines import BsdfPaths
+from warp_gi.techniques.sample_octree import Lesson
+
+BITS = (32, 64, 96, 128)
+
+
+@dataclass(frozen=True)
+class GuidedPaths(BsdfPaths):
+    """Indirect light by path tracing, whose directions also come from a quadtree that each region learns.
+
+    A quadtree of a few bits holds where light came from in the frames before; directions by it and by the BSDF are
+    combined by the balance heuristic. Unbiased but for ``max_depth`` and ``clamp``. Every path vertex uses it.
+    """
+
+    term: ClassVar[str] = "indirect"
+
+    bits: int = 128
+    """Of one quadtree: 32, 64, 96 or 128."""
+    migrations: int = 8
+    """Leaves of a quadtree that may move in a frame; 1 in the paper."""
+    significance: float = 0.1
+    """Leaves move only where the squared light of one, times this, exceeds that of the four given up."""
+    bsdf_share: float = 0.5
+    """Share of directions by the BSDF: the first one, and the only one unless ``adapts_share``."""
+    adapts_share: bool = True
+    """Whether each region learns the share that its samples would have varied least with."""
+    stratified: bool = True
+    """Whether two numbers are warped top-down, which keeps them stratified, or a third picks a leaf as in the paper."""
+    samples: int = 4096
+    """Samples a region that are looked at, each frame."""
+
+    def validate(self) -> None:
+        """Raise OptionError for settings out of range."""
+        super().validate()
+        if self.bits not in BITS:
+            raise OptionError(f"bits must be one of {', '.join(map(str, BITS))}, got {self.bits}")
+        for name, low, high in (("migrations", 0, 32), ("samples", 1, 1 << 24)):
+            if not low <= getattr(self, name) <= high:
+                raise OptionError(f"{name} must be from {low} to {high}, got {getattr(self, name)}")
+        if not 0.0 <= self.significance <= 1.0:
+            raise OptionError(f"significance must be from 0 to 1, got {self.significance}")
+        if not 0.02 <= self.bsdf_share <= 0.98:
+            raise OptionError(f"bsdf_share must be from 0.02 to 0.98, got {self.bsdf_share}")
+
+    @property
+    def learns(self) -> bool:
+        """Regions are learnt from samples."""
+        return True
+
+    def bake_key(self, scene: Any) -> str:
+        """Return a hash of all but the sky."""
+        return scene.contents_hash
+
+    def start(self, scene: Any, device: str, bake: Any, seed: int = 0) -> GuideState:
+        """Return even quadtrees for the eight leaves of the first octree."""
+        device = launch.get_device(device)
+        guides = _guides(8, device)
+        guides.trees.fill_(wp.vec4ui(*quadtree.quadtree_uniform(self.bits)))
+        guides.shares.fill_(wp.vec2(self.bsdf_share, self.bsdf_share))
+        return self._counted(guides, device)
+
+    def preprocess(self, frame: Any, state: GuideState) -> GuideState:
+        """Give paths the quadtrees."""
+        data = guided_directions.GuidedDirections()
+        data.bits, data.stratified = self.bits, int(self.stratified)
+        data.trees, data.shares, data.counts = state.guides.trees, state.guides.shares, state.counts
+        frame.directions = SamplerInUse(guided_directions.GUIDED_DIRECTIONS, data)
+        return state
+
+    def learn(self, lesson: Lesson, state: GuideState) -> GuideState:
+        """Adapt the quadtrees to the samples of the frame."""
+        device = lesson.device
+        guides = _guides(lesson.octree.leaf_count, device)
+        uniform = wp.vec4ui(*quadtree.quadtree_uniform(self.bits))
+        inputs = [lesson.origins, state.guides, guides, uniform, self.bsdf_share]
+        lesson.launch(guided_shares.take_over_guides, inputs, 256)
+        samples = lesson.leaf_samples(self.samples)
+        if self.adapts_share:
+            lesson.launch(guided_shares.adapt_shares, [samples, lesson.records, guides, self.bsdf_share])
+        adaptation = self._adaptation(guides, device)
+        records = quadtree_adapt.QuadtreeSamples()
+        records.starts, records.counts, records.order = samples.starts, samples.counts, samples.order
+        records.directions, records.contributions = lesson.records.directions, lesson.records.contributions
+        lesson.launch(quadtree_adapt.adapt_quadtrees, [records, adaptation])
+        return GuideState(guides, adaptation.counts)
+
+    def _adaptation(self, guides: guided_shares.GuideKnowledge, device: wp.Device) -> quadtree_adapt.QuadtreeAdaptation:
+        leaves = guides.trees.shape[0]
+        adaptation = quadtree_adapt.QuadtreeAdaptation()
+        adaptation.bits, adaptation.migrations = self.bits, self.migrations
+        adaptation.significance, adaptation.most_samples = self.significance, self.samples
+        adaptation.trees = guides.trees
+        adaptation.counts = wp.empty(leaves * self.bits // 4, dtype=wp.uint32, device=device)
+        adaptation.energies = wp.empty(leaves * 4 * self.bits, dtype=wp.float32, device=device)
+        return adaptation
+
+    def _counted(self, guides: guided_shares.GuideKnowledge, device: wp.Device) -> GuideState:
+        """Return the state of quadtrees as they are."""
+        adaptation = self._adaptation(guides, device)
+        none = quadtree_adapt.QuadtreeSamples()
+        leaves = guides.trees.shape[0]
+        none.starts = none.counts = wp.zeros(leaves, dtype=wp.int32, device=device)
+        launch.launch(quadtree_adapt.adapt_quadtrees, leaves, [none, adaptation], device)
+        return GuideState(guides, adaptation.counts)
+
+
+@dataclass
+class GuideState:
+    """What every region knows of directions."""
+
+    guides: guided_shares.GuideKnowledge
+    counts: wp.array
+    """uint32 [leaf * bits / 4], which follows from the trees."""
+
+
+def _guides(leaves: int, device: wp.Device) -> guided_shares.GuideKnowledge:
+    guides = guided_shares.GuideKnowledge()
+    guides.trees = wp.empty(leaves, dtype=wp.vec4ui, device=device)
+    guides.shares = wp.empty(leaves, dtype=wp.vec2, device=device)
+    guides.moments = wp.zeros(2 * leaves, dtype=guided_shares.ShareMoments, device=device)
+    return guides

@@ -1,0 +1,199 @@
+"""Direct light from emitters that were seen lately: the visibility light cache (temporal_reuse.txt, section 4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+
+from warp_gi import launch
+from warp_gi.alias import AliasTable
+from warp_gi.errors import OptionError
+from warp_gi.estimator import Estimator, SamplerInUse
+from warp_gi.kernels import light_cache, light_cache_build, light_cache_native, path_trace, types
+from warp_gi.techniques.ltc import ltc_table
+from warp_gi.techniques.sample_octree import Lesson, running_sums
+
+
+@dataclass(frozen=True)
+class VisibilityLightCache(Estimator):
+    """Direct light from emitters, of which each region samples those that the frame before found visible there.
+
+    Lights are selected by what they reflect at the very point: the closed-form cosine integral of their triangle, and
+    linearly transformed cosines for GGX. A share of samples explores. Unbiased. Every path vertex uses it.
+    """
+
+    term: ClassVar[str] = "emitters"
+
+    capacity: int = 32
+    """Lights a bucket at most, 1 to 32; more lights go to more buckets, of which a sample weighs one."""
+    exploration: float = 0.1
+    """Share of samples that explore, at most, in (0, 1]."""
+    least_exploration: float = 0.02
+    """Share that it falls to where nothing new is found; as ``exploration``, it stays."""
+    memory: int = 4
+    """Frames that a light stays in a region after it was last seen, 0 to 200."""
+    energy: float = 1.0
+    """Weight of a light's power in exploration."""
+    change: float = 1.0
+    """Weight in exploration of how far a light moved, times its power."""
+    distance: float = 1.0
+    """Weight in exploration of a light's nearness to the camera."""
+    samples: int = 2048
+    """Samples a region that are looked at, each frame."""
+
+    def validate(self) -> None:
+        """Raise OptionError for settings out of range."""
+        for name, low, high in (
+            ("capacity", 1, light_cache_native.CAPACITY),
+            ("memory", 0, 200),
+            ("samples", 1, 1 << 24),
+        ):
+            if not low <= getattr(self, name) <= high:
+                raise OptionError(f"{name} must be from {low} to {high}, got {getattr(self, name)}")
+        if not 0.0 < self.exploration <= 1.0:
+            raise OptionError(f"exploration must be above 0 and at most 1, got {self.exploration}")
+        if not 0.0 < self.least_exploration <= self.exploration:
+            raise OptionError(
+                f"least_exploration must be above 0 and at most exploration ({self.exploration}), "
+                f"got {self.least_exploration}"
+            )
+        weights = (self.energy, self.change, self.distance)
+        if not (min(weights) >= 0.0 and max(weights) > 0.0 and np.isfinite(weights).all()):
+            raise OptionError(f"energy, change and distance must not be negative, and one above 0, got {weights}")
+
+    @property
+    def learns(self) -> bool:
+        """Regions are learnt from samples."""
+        return True
+
+    def bake_key(self, scene: Any) -> str:
+        """Return a hash of all but the sky."""
+        return scene.contents_hash
+
+    def start(self, scene: Any, device: str, bake: Any, seed: int = 0) -> CacheState | None:
+        """Return empty caches for the eight leaves of the first octree."""
+        if scene.emitter_count == 0:
+            return None
+        device = launch.get_device(device)
+        centers = _places(scene.data(device))[0]
+        return CacheState(_tables(8, device, self.exploration), _lists(8, device), centers)
+
+    def preprocess(self, frame: Any, state: CacheState | None) -> CacheState | None:
+        """Bring the shapes of lights and the table of exploration up to the frame, and give paths the cache."""
+        if state is None:
+            return None
+        scene, device = frame.scene, frame.device
+        emitters = frame.data.emitters
+        powers = scene.emitter_powers()
+        centers, moved = state.centers, np.zeros(len(powers))
+        if state.shapes is None or scene.is_animated:
+            centers, areas, sides = _places(frame.data)
+            moved = _distances(centers, state.centers)
+            luminances = (powers / (np.pi * np.maximum(areas * sides, 1e-30)) * (areas > 0)).astype(np.float32)
+            shapes = wp.empty(len(centers), dtype=light_cache_native.LightShape, device=device)
+            inputs = [frame.data, launch.on_device(luminances, wp.float32, device), shapes]
+            frame.launch(light_cache.shape_lights, inputs, len(centers))
+            state = replace(state, centers=centers, shapes=shapes)
+        if moved.any():  # what is known is in doubt everywhere
+            tables = launch.copied(state.tables, light_cache.CacheTables)
+            leaves = tables.buckets.shape[0]
+            tables.exploration = wp.full(leaves, self.exploration, dtype=wp.float32, device=device)
+            state = replace(state, tables=tables)
+        near = 1.0 / (_distances(centers, frame.camera.position) ** 2 + (0.02 * scene.radius) ** 2)
+        weights = np.zeros(len(powers))
+        for share, part in ((self.energy, powers), (self.change, powers * moved), (self.distance, near * (powers > 0))):
+            if part.sum() > 0:
+                weights += share * part / part.sum()
+        emitters.alias = AliasTable.build(weights).on(device)
+        cache = light_cache.LightCache()
+        cache.shapes, cache.emitters = state.shapes, emitters.emitters
+        cache.ltc, cache.tables = ltc_table(device), state.tables
+        frame.lights = SamplerInUse(light_cache.CACHED_LIGHTS, cache)
+        return state
+
+    def trace(self, frame: Any, state: Any) -> None:
+        """Ask the shared path launch for this term."""
+        frame.request_paths(path_trace.TERM_EMITTERS)
+
+    def learn(self, lesson: Lesson, state: CacheState | None) -> CacheState | None:
+        """Make the caches of the next frame from the samples of this one."""
+        if state is None:
+            return None
+        device, leaves = lesson.device, lesson.octree.leaf_count
+        settings = light_cache_build.CacheSettings()
+        settings.capacity, settings.memory = self.capacity, self.memory
+        settings.hysteresis = 0.75
+        settings.exploration, settings.least_exploration = self.exploration, self.least_exploration
+        samples, origins = lesson.leaf_samples(self.samples), lesson.origins
+
+        seen = _lists(leaves, device)
+        seen.entries = wp.empty(2 * samples.order.shape[0], dtype=wp.int32, device=device)
+        discoveries = wp.empty(leaves, dtype=wp.int32, device=device)
+        lesson.launch(light_cache_build.list_seen_lights, [samples, lesson.records.lights, seen, discoveries])
+        joined = _lists(leaves, device)
+        around = [seen, state.known, lesson.neighbours, origins]
+        lesson.launch(light_cache_build.bound_lists, [*around, joined.counts])
+        joined.offsets, size = running_sums(joined.counts)
+        joined.entries = wp.zeros(size, dtype=wp.int32, device=device)
+        lesson.launch(light_cache_build.join_lights, [*around, joined, self.memory])
+
+        tables, sizes = _tables(leaves, device, self.exploration), wp.empty(leaves, dtype=wp.int32, device=device)
+        inputs = [settings, joined, origins, state.tables, tables, sizes]
+        lesson.launch(light_cache_build.count_buckets, inputs)
+        tables.offsets, size = running_sums(sizes)
+        tables.items = wp.zeros(size, dtype=wp.int32, device=device)
+        lesson.launch(light_cache_build.fill_buckets, [settings, joined, tables])
+        inputs = [settings, samples, discoveries, origins, state.tables.exploration, tables.exploration]
+        lesson.launch(light_cache_build.adapt_exploration, inputs)
+        return CacheState(tables, joined, state.centers, state.shapes)
+
+
+@dataclass
+class CacheState:
+    """The caches of all regions, and where lights were."""
+
+    tables: light_cache.CacheTables
+    known: light_cache_build.LightLists
+    """Every region's lights with the frames since they were seen, of which the tables are made."""
+    centers: np.ndarray
+    """float64 [emitter, 3] metres, in the last frame."""
+    shapes: wp.array | None = field(default=None, metadata={"derived": True})
+    """LightShape [emitter]; None before the first frame."""
+
+
+def _tables(leaves: int, device: wp.Device, exploration: float) -> light_cache.CacheTables:
+    tables = light_cache.CacheTables()
+    tables.buckets = wp.zeros(leaves, dtype=wp.int32, device=device)
+    tables.offsets = wp.zeros(leaves, dtype=wp.int32, device=device)
+    tables.items = wp.zeros(0, dtype=wp.int32, device=device)
+    tables.exploration = wp.full(leaves, exploration, dtype=wp.float32, device=device)
+    return tables
+
+
+def _lists(leaves: int, device: wp.Device) -> light_cache_build.LightLists:
+    lists = light_cache_build.LightLists()
+    lists.offsets = wp.zeros(leaves, dtype=wp.int32, device=device)
+    lists.counts = wp.zeros(leaves, dtype=wp.int32, device=device)
+    lists.entries = wp.zeros(0, dtype=wp.int32, device=device)
+    return lists
+
+
+def _places(data: types.SceneData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return centre [n, 3], area and number of emitting sides of each emitter; area 0 for lights without size."""
+    table = data.emitters.emitters.numpy()
+    centers, areas, sides = table["position"].astype(np.float64), np.zeros(len(table)), np.ones(len(table))
+    has_size = table["kind"] == types.EMITTER_TRIANGLE
+    triangles = table["triangle"][has_size]
+    points = data.geometry.points.numpy()[data.geometry.indices.numpy()[triangles]].astype(np.float64)
+    centers[has_size] = points.mean(axis=1)
+    areas[has_size] = np.linalg.norm(np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]), axis=1) / 2
+    two_sided = data.materials.numpy()["double_sided"][data.geometry.materials.numpy()[triangles]]
+    sides[has_size] = 1.0 + two_sided
+    return centers, areas, sides
+
+
+def _distances(points: np.ndarray, others: Any) -> np.ndarray:
+    return np.linalg.norm(points - np.asarray(others, np.float64), axis=1)
