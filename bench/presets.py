@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import warp_gi as gi
+from warp_gi.scene.builtin import shapes
 
 SCENES = Path(os.environ.get("WARP_GI_SCENES", Path(__file__).resolve().parents[1] / ".." / "shared" / "scenes"))
 """Folder of the scene files, which are not part of the project."""
@@ -157,3 +158,111 @@ PRESETS: dict[str, Preset] = {
         lambda: spheres(SCENES / "environments/interior.exr"), SPHERES_VIEW, 5, ("environments/interior.exr",)
     ),
 }
+
+
+# ---- scenes of sample reuse (temporal_reuse.txt, figures 8, 10 and 13b); seen as they are, by gi alone ----
+
+FPS = 24.0
+_COVER = 2.35  # m, height of the dragon's cover
+RING_RADIUS, RING_WALL = 2.0, 3.0
+"""Metres, of the floor and of the wall around it."""
+STROBE_PERIODS = {"jump": 32, "slit": 16}
+"""Frames after which the lamp of `strobe` is where it was."""
+_CYCLES = 8
+
+
+def covered_dragon() -> gi.Scene:
+    """The Stanford dragon, 2 m long, in a room under a grille, above which ten lamps hang."""
+    grey = gi.Material("grey", (0.6, 0.6, 0.6), specular=0.0)
+    brass = gi.Material("dragon", (0.55, 0.40, 0.22), roughness=0.5)
+    loaded = gi.load_scene(SCENES / "stanford_dragon.ply", scale=10.0)
+    low, _ = loaded.bounds
+    nodes = []
+    for node in loaded.nodes:
+        meshes = [replace(mesh, material=brass) for mesh in node.meshes]
+        nodes.append(replace(node, meshes=meshes, parent_from_node=_moved(-low[1]) @ node.parent_from_node))
+    room = [
+        quad((-3, 0, 3), (6, 0, 0), (0, 0, -6), grey, "floor"),
+        quad((-3, 0, -3), (6, 0, 0), (0, 4, 0), grey, "back"),
+        quad((-3, 0, 3), (0, 0, -6), (0, 4, 0), gi.Material("red", (0.6, 0.25, 0.2), specular=0.0), "left"),
+        quad((3, 0, -3), (0, 0, 6), (0, 4, 0), gi.Material("blue", (0.2, 0.3, 0.6), specular=0.0), "right"),
+        quad((3, 0, 3), (-6, 0, 0), (0, 4, 0), grey, "front"),
+        quad((-3, 4, -3), (6, 0, 0), (0, 0, 6), grey, "ceiling"),
+    ]
+    bars = [shapes.box((-3, _COVER, z - 0.11), (3, _COVER + 0.06, z + 0.11)) for z in np.arange(-2.85, 3, 0.3)]
+    bars += [shapes.box((x - 0.11, _COVER, -3), (x + 0.11, _COVER + 0.06, 3)) for x in np.arange(-2.85, 3, 0.3)]
+    lamps = []
+    for k in range(10):
+        x, z, strength = 1.1 * (k % 5 - 2), (-0.9, 0.8)[k // 5] + 0.15 * (k % 3), 40.0 * (1 + k % 4)
+        radiance = (strength, strength * (1.0, 0.85, 0.7)[k % 3], strength * (1.0, 0.7, 0.45)[k % 3])
+        lamps.append(quad((x, 3.3, z), (0.3, 0, 0), (0, 0, 0.3), light(radiance), f"lamp {k}"))
+    cover = shapes.merge(bars).mesh(grey, "cover")
+    return gi.Scene([*nodes, gi.Node("room", room), gi.Node("cover", [cover]), gi.Node("lamps", lamps)], name="dragon")
+
+
+def guiding_ring(turn: float = 9.0, frame: int = 40, start: float = 0.0) -> gi.Scene:
+    """Figure 10: a round floor in a round wall, lit by a spot on the wall from a light below the floor.
+
+    The light turns by ``turn`` degrees from ``start`` between ``frame`` - 1 and ``frame``.
+    """
+    grey = gi.Material("grey", (0.6, 0.6, 0.6), specular=0.0)
+    height = np.array([-1.5, 2.5])
+    wall = shapes.lathe([(RING_WALL, y) for y in height[::-1]], 120)
+    floor = shapes.lathe([(RING_RADIUS, 0.0), (0.0, 0.0)], 120)
+    node = gi.Node("light", [], keyframes=_steps([(0.0, (0, 0, 0), start), (frame / FPS, (0, 0, 0), start + turn)]))
+    # the cone leaves through the gap between floor and wall, and meets the wall about 1 m above the floor
+    below = gi.PunctualLight(
+        "spot", (300.0, 300.0, 300.0), (1.5, -1.0, 0.0), (0.6, 0.8, 0.0), np.radians(7.0), np.radians(10.0), node=0
+    )
+    meshes = [wall.mesh(grey, "wall"), floor.mesh(grey, "floor")]
+    return gi.Scene([node, gi.Node("arena", meshes)], [below], name="guiding_ring")
+
+
+def strobe(kind: str = "jump") -> gi.Scene:
+    """A room of dim lamps, and a bright one that is not where it was: "jump"s into a closed box, or passes a "slit".
+
+    It jumps every half of `STROBE_PERIODS`; along the slits it moves every frame, there and back.
+    """
+    grey = gi.Material("grey", (0.6, 0.6, 0.6), specular=0.0)
+    room = [shapes.box((-3, 0, -3), (3, 3, 3)).flipped().mesh(grey, "room")]
+    room += [shapes.box((-1.6, 0, -1.2), (-0.8, 1.1, -0.4)).mesh(grey, "block")]
+    dim = light((6.0, 6.0, 6.0))
+    room += [quad((x, 2.98, z), (0.2, 0, 0), (0, 0, 0.2), dim, "dim") for x in (-2.2, 2.0) for z in (-2.2, 2.0)]
+    lamp = quad((-0.15, 0, -0.15), (0.3, 0, 0), (0, 0, 0.3), light((60.0, 50.0, 40.0)), "lamp")
+    period = STROBE_PERIODS[kind]
+    half = period // 2
+    if kind == "jump":
+        room.append(shapes.box((1.5, 0.02, -2.5), (2.5, 0.9, -1.5)).mesh(grey, "box"))
+        places = [(0.3, 2.6, 0.0), (2.0, 0.45, -2.0)] * _CYCLES
+        poses = [(k * half / FPS, place, 0.0) for k, place in enumerate(places)]
+    else:
+        slats = [shapes.box((x - 0.22, 1.95, -1), (x + 0.22, 2.0, 1)) for x in np.arange(-2.75, 3, 0.5)]
+        room.append(shapes.merge(slats).mesh(grey, "slats"))
+        steps = [strobe_place(kind, k) for k in range(period * _CYCLES)]
+        poses = [(k / FPS, (3.6 * step / half - 1.8, 2.6, 0.0), 0.0) for k, step in enumerate(steps)]
+    return gi.Scene([gi.Node("room", room), gi.Node("lamp", [lamp], keyframes=_steps(poses))], name=f"strobe {kind}")
+
+
+def strobe_place(kind: str, frame: int) -> int:
+    """Return the number of the place, 0 to half the period at most, where the lamp of `strobe` is in a frame."""
+    half = STROBE_PERIODS[kind] // 2
+    phase = frame % (2 * half)
+    return phase // half if kind == "jump" else min(phase, 2 * half - phase)
+
+
+def _steps(poses: list[tuple[float, tuple[float, float, float], float]]) -> list[gi.Keyframe]:
+    """Return keyframes that hold each of ``poses`` (seconds, place, degrees about y) until the next begins."""
+    keys: list[gi.Keyframe] = []
+    for k, (begin, place, turn) in enumerate(poses):
+        half = np.radians(turn) / 2
+        rotation = (0.0, float(np.sin(half)), 0.0, float(np.cos(half)))
+        end = poses[k + 1][0] if k + 1 < len(poses) else begin + 1.0
+        for time in (begin - 0.25 / FPS, end - 0.5 / FPS):
+            keys.append(gi.Keyframe(time, tuple(map(float, place)), rotation))
+    return keys
+
+
+def _moved(y: float) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[1, 3] = y
+    return matrix

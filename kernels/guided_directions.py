@@ -6,7 +6,7 @@ A share of directions, which each region learns for itself, comes from the BSDF;
 
 import warp as wp
 
-from warp_gi.kernels.bsdf import Bsdf, bsdf_evaluate, bsdf_sample
+from warp_gi.kernels.bsdf import Bsdf, average_reflectance, bsdf_evaluate, bsdf_sample
 from warp_gi.kernels.path_samplers import DirectionSample, DirectionSampler
 from warp_gi.kernels.quadtree import quadtree_pdf, quadtree_sample_leaf, quadtree_sample_warp
 from warp_gi.kernels.samples import GLOSSY_ALPHA
@@ -74,9 +74,11 @@ def guided_direction(
         value = f.value
     r.pdf = r.bsdf_share * r.bsdf_pdf + (1.0 - r.bsdf_share) * guide_pdf
     r.weight = value / r.pdf
+    r.reflected = average_reflectance(s.bsdf)
     if s.bsdf.f90 <= 0.0:  # f cos / colour is the pdf of the BSDF
         weight = r.bsdf_pdf / r.pdf
         r.weight = wp.vec3(weight, weight, weight)
+        r.reflected = wp.vec3(1.0, 1.0, 1.0)
     return r
 
 

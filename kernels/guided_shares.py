@@ -17,19 +17,19 @@ ShareMoments = wp.types.vector(length=SHARES, dtype=wp.float32)
 FADING = wp.constant(wp.float32(0.8))  # of what is known, each frame
 
 
-# One of the shares that are tried.
+# One of the shares that are tried. A direction that the quadtree has no idea of has a weight of up to 1 / share.
 @wp.func
 def candidate_share(k: wp.int32) -> wp.float32:
     if k == 0:
-        return 0.1
+        return 0.3
     if k == 1:
-        return 0.25
+        return 0.4
     if k == 2:
         return 0.5
     if k == 3:
-        return 0.75
+        return 0.65
     if k == 4:
-        return 0.9
+        return 0.8
     return 0.97
 
 
@@ -50,6 +50,7 @@ class GuideKnowledge:
     trees: wp.array(dtype=wp.vec4ui)  # [leaf]
     shares: wp.array(dtype=wp.vec2)  # [leaf]
     moments: wp.array(dtype=ShareMoments)  # [2 leaf + is glossy]
+    energies: wp.array(dtype=wp.float32)  # [leaf * 4 * bits] QuadtreeAdaptation.energies
 
 
 # Thread: a leaf. Takes over what the leaf of the previous tree knew; `first_tree` where there was none.
@@ -64,6 +65,12 @@ def take_over_guides(
 ):
     leaf = first + wp.tid()
     origin = origins[leaf]
+    size = guides.energies.shape[0] / guides.trees.shape[0]
+    for i in range(size):
+        energy = float(0.0)
+        if origin >= 0:
+            energy = known.energies[origin * size + i]
+        guides.energies[leaf * size + i] = energy
     if origin < 0:
         guides.trees[leaf] = first_tree
         guides.shares[leaf] = wp.vec2(first_share, first_share)

@@ -1,10 +1,13 @@
 """The visibility light cache: each region's lights that were seen from there lately, sampled by what they reflect.
 
-After temporal_reuse.txt, section 4. A region's lights are spread over a power of two of buckets by the last bits of
-their index. Selecting one picks a bucket at random, weighs all lights in it for the very point (ltc.py), and picks one
-by weight. With a small share, and where the cache has nothing to offer, a light is explored instead, from an alias
-table over all. Both ways can yield a light, and its probability is that of both together (Algorithm 1), so that
-estimates are unbiased whatever the cache holds.
+After temporal_reuse.txt, section 4. The lights that matter most to a region are its first bucket; others are spread
+over a power of two of buckets by the last bits of their index. Selecting one picks a bucket by what its lights may
+bring to the region, weighs all of them for the very point (ltc.py), and picks one by weight. (The paper has no first
+bucket, and picks buckets evenly: in a room of a hundred lamps, the near ones are in the bucket that was not picked.)
+
+With a small share, and where the cache has nothing to offer, a light is explored instead, by the hierarchy over all
+lights (or an alias table, the paper's way). Both ways can yield a light, and its probability is that of both together
+(Algorithm 1), so that estimates are unbiased whatever the cache holds.
 """
 
 import warp as wp
@@ -13,9 +16,10 @@ from warp_gi.kernels.alias import LARGEST_FLOAT_BELOW_ONE, alias_choice
 from warp_gi.kernels.bsdf import bsdf_evaluate, luminance
 from warp_gi.kernels.emitters import LightChoice, punctual_light
 from warp_gi.kernels.light_cache_native import BucketWeights, LightShape, weigh_triangles
+from warp_gi.kernels.light_hierarchy import LightTree, hierarchy_choice, hierarchy_pdf
 from warp_gi.kernels.ltc import LobeWeights, LtcTable, lobe_weights, triangle_weight
 from warp_gi.kernels.path_samplers import LightSampler
-from warp_gi.kernels.surface import Surface, ray_origin
+from warp_gi.kernels.surface import Surface, ray_origin, shading_normal
 from warp_gi.kernels.types import EMITTER_TRIANGLE, Emitter, SceneData
 
 wp.set_module_options({"enable_backward": False})
@@ -26,9 +30,10 @@ MOST_BUCKETS = wp.constant(64)  # of a region
 # The lights of every region.
 @wp.struct
 class CacheTables:
-    buckets: wp.array(dtype=wp.int32)  # [leaf] number of buckets, a power of two or 0; above 16 bits how many are empty
-    offsets: wp.array(dtype=wp.int32)  # [leaf] start in `items`
+    buckets: wp.array(dtype=wp.int32)  # [leaf] number of buckets: 0, 1, or 1 and a power of two
+    offsets: wp.array(dtype=wp.int32)  # [leaf] start in `items` and `chances`
     items: wp.array(dtype=wp.int32)  # of each leaf: where its buckets end, then the emitters bucket by bucket
+    chances: wp.array(dtype=wp.float32)  # of each leaf: of its buckets up to this one together; 1 for the last
     exploration: wp.array(dtype=wp.float32)  # [leaf] share of samples that explore
 
 
@@ -38,47 +43,108 @@ class LightCache:
     emitters: wp.array(dtype=Emitter)  # [emitter] those of the scene; the rest of it would be much to hand on
     ltc: LtcTable
     tables: CacheTables
+    explores_by_tree: wp.int32  # 1: `tree`, 0: the alias table of the emitters
+    tree: LightTree
 
 
-# What selection needs to know of a region: where its table is, and the shares of both ways.
+# What selection needs to know of a region.
 @wp.struct
 class CacheRegion:
     buckets: wp.int32
     items: wp.int32  # start of its table
     explores: wp.float32  # probability of exploring
-    share: wp.float32  # of exploring, with what falls to it from empty buckets
 
 
 @wp.struct
 class Bucket:
-    begin: wp.int32  # in LightCache.items
+    begin: wp.int32  # in CacheTables.items
     count: wp.int32
+    chance: wp.float32  # of being picked, where a sample does not explore
 
 
 @wp.func
 def cache_region(cache: LightCache, region: wp.int32) -> CacheRegion:
     r = CacheRegion()
-    word = cache.tables.buckets[region]
-    r.buckets = word & 0xFFFF
+    r.buckets = cache.tables.buckets[region]
     r.explores = 1.0
-    r.share = 1.0
     if r.buckets > 0:
         r.items = cache.tables.offsets[region]
         r.explores = cache.tables.exploration[region]
-        empty = wp.float32(word >> 16) / wp.float32(r.buckets)
-        r.share = r.explores + (1.0 - r.explores) * empty
     return r
 
 
 @wp.func
-def bucket_of(cache: LightCache, region: CacheRegion, number: wp.int32) -> Bucket:
+def bucket_of(tables: CacheTables, region: CacheRegion, number: wp.int32) -> Bucket:
     r = Bucket()
     begin = int(0)
+    chance = float(0.0)
     if number > 0:
-        begin = cache.tables.items[region.items + number - 1]
-    r.count = cache.tables.items[region.items + number] - begin
+        begin = tables.items[region.items + number - 1]
+        chance = tables.chances[region.items + number - 1]
+    r.count = tables.items[region.items + number] - begin
     r.begin = region.items + region.buckets + begin
+    r.chance = tables.chances[region.items + number] - chance
     return r
+
+
+# Where a light is, if the region knows it.
+@wp.struct
+class BucketPlace:
+    bucket: Bucket
+    place: wp.int32  # -1: nowhere
+
+
+# Place of an emitter in a bucket, -1 if it is not there; they are sorted.
+@wp.func
+def find_in_bucket(items: wp.array(dtype=wp.int32), bucket: Bucket, emitter: wp.int32) -> wp.int32:
+    low = bucket.begin
+    high = bucket.begin + bucket.count
+    while low < high:
+        middle = (low + high) / 2
+        if items[middle] < emitter:
+            low = middle + 1
+        else:
+            high = middle
+    if low < bucket.begin + bucket.count and items[low] == emitter:
+        return low - bucket.begin
+    return -1
+
+
+@wp.func
+def find_light(tables: CacheTables, region: CacheRegion, emitter: wp.int32) -> BucketPlace:
+    r = BucketPlace()
+    r.place = -1
+    if region.buckets > 0:
+        r.bucket = bucket_of(tables, region, 0)
+        r.place = find_in_bucket(tables.items, r.bucket, emitter)
+        if r.place < 0 and region.buckets > 1:
+            r.bucket = bucket_of(tables, region, 1 + (emitter & (region.buckets - 2)))
+            r.place = find_in_bucket(tables.items, r.bucket, emitter)
+    return r
+
+
+# A light that the region need not know. By the hierarchy, whose probabilities depend on the point, an unknown light
+# that matters there has a weight that is not far too large when it is found.
+@wp.func
+def explored_light(cache: LightCache, scene: SceneData, s: Surface, u: wp.vec2) -> LightChoice:
+    r = LightChoice()
+    r.is_new = 1
+    if cache.explores_by_tree != 0:
+        by_tree = hierarchy_choice(cache.tree, ray_origin(s), shading_normal(s), u[0], u[1])
+        r.item = by_tree.item
+        r.pdf = by_tree.pdf
+    else:
+        by_table = alias_choice(scene.emitters.alias, scene.emitters.count, u[0], u[1])
+        r.item = by_table.item
+        r.pdf = by_table.pdf
+    return r
+
+
+@wp.func
+def explored_light_pdf(cache: LightCache, scene: SceneData, s: Surface, emitter: wp.int32) -> wp.float32:
+    if cache.explores_by_tree != 0:
+        return hierarchy_pdf(cache.tree, ray_origin(s), shading_normal(s), emitter)
+    return scene.emitters.alias[emitter].pdf
 
 
 # Luminance that a surface reflects of an emitter, were nothing in between. `origin` is the point, `w` its lobes.
@@ -128,15 +194,6 @@ def weigh_bucket(cache: LightCache, s: Surface, wo: wp.vec3, bucket: Bucket) -> 
     return r
 
 
-# Place of an emitter in its bucket, -1 if it is not there; they are sorted.
-@wp.func
-def find_in_bucket(cache: LightCache, bucket: Bucket, emitter: wp.int32) -> wp.int32:
-    for k in range(bucket.count):
-        if cache.tables.items[bucket.begin + k] == emitter:
-            return k
-    return -1
-
-
 # Algorithm 1 of temporal_reuse.txt: either way one bucket is weighed, and once.
 @wp.func
 def cached_light(
@@ -144,41 +201,40 @@ def cached_light(
 ) -> LightChoice:
     r = LightChoice()
     here = cache_region(cache, region)
-    bucket = Bucket()
+    found = BucketPlace()
+    found.place = -1
     rest = float(0.0)
-    explores = u[0] < here.explores
-    if explores:
-        rest = wp.min(u[0] / here.explores, LARGEST_FLOAT_BELOW_ONE)
-    else:
-        position = (u[0] - here.explores) / (1.0 - here.explores) * wp.float32(here.buckets)
-        number = wp.min(wp.int32(position), here.buckets - 1)
-        rest = wp.min(position - wp.float32(number), LARGEST_FLOAT_BELOW_ONE)
-        bucket = bucket_of(cache, here, number)
-        explores = bucket.count == 0
-    place = int(-1)
-    if explores:
-        choice = alias_choice(scene.emitters.alias, scene.emitters.count, rest, u[1])
-        r.item = choice.item
-        r.pdf = here.share * choice.pdf
-        if here.buckets > 0:
-            bucket = bucket_of(cache, here, r.item & (here.buckets - 1))
-            place = find_in_bucket(cache, bucket, r.item)
-        if place < 0:
-            r.is_new = 1
+    if u[0] < here.explores:
+        stretch = 1.0 / here.explores  # of what is left of u[0], whose digits u[1] continues
+        rest = wp.min(u[0] * stretch, LARGEST_FLOAT_BELOW_ONE)
+        r = explored_light(cache, scene, s, wp.vec2(rest, wp.min(u[1] * stretch, LARGEST_FLOAT_BELOW_ONE)))
+        r.pdf = here.explores * r.pdf
+        if r.item >= 0:
+            found = find_light(cache.tables, here, r.item)
+        if found.place < 0:
             return r
-    weighed = weigh_bucket(cache, s, wo, bucket)
-    if not explores:
+        r.is_new = 0
+    else:
+        rest = (u[0] - here.explores) / (1.0 - here.explores)
+        number = int(0)
+        while number < here.buckets - 1 and rest >= cache.tables.chances[here.items + number]:
+            number += 1
+        found.bucket = bucket_of(cache.tables, here, number)
+        if number > 0:
+            rest = rest - cache.tables.chances[here.items + number - 1]
+        rest = wp.clamp(rest / found.bucket.chance, 0.0, LARGEST_FLOAT_BELOW_ONE)
+    weighed = weigh_bucket(cache, s, wo, found.bucket)
+    if found.place < 0:
         left = rest * weighed.total
-        for k in range(bucket.count):
+        for k in range(found.bucket.count):
             if weighed.weights[k] > 0.0:
-                place = k  # the last one that can be selected, should rounding leave something
+                found.place = k  # the last one that can be selected, should rounding leave something
                 if left < weighed.weights[k]:
                     break
                 left = left - weighed.weights[k]
-        r.item = cache.tables.items[bucket.begin + place]
-        r.pdf = here.share * scene.emitters.alias[r.item].pdf
-    share = (1.0 - here.explores) / wp.float32(here.buckets)
-    r.pdf = r.pdf + share * weighed.weights[place] / weighed.total
+        r.item = cache.tables.items[found.bucket.begin + found.place]
+        r.pdf = here.explores * explored_light_pdf(cache, scene, s, r.item)
+    r.pdf = r.pdf + (1.0 - here.explores) * found.bucket.chance * weighed.weights[found.place] / weighed.total
     return r
 
 
@@ -188,14 +244,11 @@ def cached_light_pdf(
     cache: LightCache, scene: SceneData, region: wp.int32, s: Surface, wo: wp.vec3, emitter: wp.int32
 ) -> wp.float32:
     here = cache_region(cache, region)
-    pdf = here.share * scene.emitters.alias[emitter].pdf
-    if here.buckets == 0:
-        return pdf
-    bucket = bucket_of(cache, here, emitter & (here.buckets - 1))
-    place = find_in_bucket(cache, bucket, emitter)
-    if place >= 0:
-        weighed = weigh_bucket(cache, s, wo, bucket)
-        pdf = pdf + (1.0 - here.explores) / wp.float32(here.buckets) * weighed.weights[place] / weighed.total
+    pdf = here.explores * explored_light_pdf(cache, scene, s, emitter)
+    found = find_light(cache.tables, here, emitter)
+    if found.place >= 0:
+        weighed = weigh_bucket(cache, s, wo, found.bucket)
+        pdf = pdf + (1.0 - here.explores) * found.bucket.chance * weighed.weights[found.place] / weighed.total
     return pdf
 
 

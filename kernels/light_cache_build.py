@@ -1,7 +1,8 @@
 """Making a region's light cache from the last frame's samples (temporal_reuse.txt, section 4.1).
 
 Lights that a region's samples saw are listed once each (`list_seen_lights`), joined with those of its six neighbours
-and with what it knew before (`join_lights`), and spread over buckets (`count_buckets`, `fill_buckets`). Lists are
+and with what it knew before (`join_lights`), ranked (`rank_lights`), and spread over buckets (`count_buckets`,
+`fill_buckets`). Lists are
 sorted by emitter, so joining is a merge, and buckets come out sorted. An entry is emitter << 8 | frames since a sample
 of the region or its neighbours saw it: a light that is seen rarely stays for some frames, which the paper leaves for
 future work (section 8).
@@ -9,9 +10,11 @@ future work (section 8).
 
 import warp as wp
 
-from warp_gi.kernels.light_cache import MOST_BUCKETS, CacheTables
-from warp_gi.kernels.octree import NEIGHBOURS
+from warp_gi.kernels.bsdf import luminance
+from warp_gi.kernels.light_cache import MOST_BUCKETS, CacheTables, LightCache
+from warp_gi.kernels.octree import NEIGHBOURS, Octree, OctreeNodes, leaf_cell
 from warp_gi.kernels.samples import LIGHT_ITEM, LIGHT_NEW, LIGHT_VISIBLE
+from warp_gi.kernels.types import EMITTER_DIRECTIONAL, EMITTER_TRIANGLE
 
 wp.set_module_options({"enable_backward": False})
 
@@ -180,14 +183,73 @@ def join_lights(
     joined.counts[leaf] = count
 
 
-# Lights in the fullest of `buckets` buckets, which are those of the emitter's last bits.
+MAIN = wp.constant(wp.float32(-1.0))  # instead of the importance of lights in the first bucket
+LEAST_CHANCE = wp.constant(wp.float32(0.05))  # shared by all buckets evenly
+
+
+# Irradiance that a light may bring to a region around `center`, but for what it meets there at a slant.
 @wp.func
-def fullest_bucket(entries: wp.array(dtype=wp.int32), begin: wp.int32, count: wp.int32, buckets: wp.int32) -> wp.int32:
+def region_importance(cache: LightCache, emitter: wp.int32, center: wp.vec3, radius: wp.float32) -> wp.float32:
+    shape = cache.shapes[emitter]
+    if shape.luminance > 0.0:
+        cross = wp.cross(shape.p1 - shape.p0, shape.p2 - shape.p0)
+        away = center - (shape.p0 + shape.p1 + shape.p2) / 3.0
+        square = wp.length_sq(away) + radius * radius
+        facing = 0.5 * wp.dot(cross, away)  # area times cosine times distance
+        if shape.two_sided != 0:
+            facing = wp.abs(facing)
+        facing = wp.max(facing, 0.0) + 0.5 * wp.length(cross) * radius
+        return shape.luminance * facing / (square * wp.sqrt(square))
+    light = cache.emitters[emitter]
+    if light.kind == EMITTER_TRIANGLE:
+        return 0.0
+    if light.kind == EMITTER_DIRECTIONAL:
+        return luminance(light.intensity)
+    return luminance(light.intensity) / (wp.length_sq(light.position - center) + radius * radius)
+
+
+# Thread: a leaf. What each of its lights may bring to it, and which of them matter most: those are marked MAIN.
+# `sums` is what these bring together.
+@wp.kernel
+def rank_lights(
+    first: wp.int32,
+    cache: LightCache,
+    octree: Octree,
+    tree: OctreeNodes,
+    joined: LightLists,
+    capacity: wp.int32,
+    importances: wp.array(dtype=wp.float32),
+    sums: wp.array(dtype=wp.float32),
+):
+    leaf = first + wp.tid()
+    count = joined.counts[leaf]
+    begin = joined.offsets[leaf]
+    cell = leaf_cell(octree, tree, leaf)
+    center = wp.vec3(cell[0], cell[1], cell[2])
+    for i in range(begin, begin + count):
+        importances[i] = region_importance(cache, joined.entries[i] >> 8, center, cell[3])
+    total = float(0.0)
+    for _k in range(wp.min(capacity, count)):
+        best = begin
+        for i in range(begin, begin + count):
+            if importances[i] > importances[best]:
+                best = i
+        total += importances[best]
+        importances[best] = MAIN
+    sums[leaf] = total
+
+
+# Lights in the fullest of `buckets` buckets of those that are not MAIN, which go by the emitter's last bits.
+@wp.func
+def fullest_bucket(
+    joined: LightLists, importances: wp.array(dtype=wp.float32), leaf: wp.int32, buckets: wp.int32
+) -> wp.int32:
+    begin = joined.offsets[leaf]
     most = int(0)
     for bucket in range(buckets):
         held = int(0)
-        for i in range(count):
-            if ((entries[begin + i] >> 8) & (buckets - 1)) == bucket:
+        for i in range(begin, begin + joined.counts[leaf]):
+            if importances[i] >= 0.0 and ((joined.entries[i] >> 8) & (buckets - 1)) == bucket:
                 held += 1
         most = wp.max(most, held)
     return most
@@ -199,49 +261,80 @@ def count_buckets(
     first: wp.int32,
     settings: CacheSettings,
     joined: LightLists,
+    importances: wp.array(dtype=wp.float32),
     origins: wp.array(dtype=wp.int32),
-    known: CacheTables,
-    tables: CacheTables,
+    known: wp.array(dtype=wp.int32),
+    buckets: wp.array(dtype=wp.int32),
     sizes: wp.array(dtype=wp.int32),
 ):
     leaf = first + wp.tid()
     count = joined.counts[leaf]
-    buckets = int(0)
-    if count > 0:
-        before = known.buckets[origins[leaf]] & 0xFFFF
-        buckets = int(1)
-        while buckets < MOST_BUCKETS:
+    chosen = wp.min(count, 1)
+    if count > settings.capacity:
+        before = known[origins[leaf]] - 1
+        others = int(1)
+        while others < MOST_BUCKETS:
             limit = settings.capacity
-            if buckets < before:
-                limit = wp.int32(wp.float32(settings.capacity) * settings.hysteresis)
-            if fullest_bucket(joined.entries, joined.offsets[leaf], count, buckets) <= limit:
+            if others < before:
+                limit = wp.max(wp.int32(wp.float32(settings.capacity) * settings.hysteresis), 1)
+            if fullest_bucket(joined, importances, leaf, others) <= limit:
                 break
-            buckets = buckets * 2
-    tables.buckets[leaf] = buckets
-    sizes[leaf] = buckets + count
+            others = others * 2
+        chosen = 1 + others
+    buckets[leaf] = chosen
+    sizes[leaf] = chosen + count
 
 
 # Thread: a leaf. Spreads its lights over its buckets; what does not fit into the last of them is left to exploration.
+# Buckets are picked by what they may bring, but none is left out.
 @wp.kernel
-def fill_buckets(first: wp.int32, settings: CacheSettings, joined: LightLists, tables: CacheTables):
+def fill_buckets(
+    first: wp.int32,
+    settings: CacheSettings,
+    joined: LightLists,
+    importances: wp.array(dtype=wp.float32),
+    sums: wp.array(dtype=wp.float32),
+    tables: CacheTables,
+):
     leaf = first + wp.tid()
     buckets = tables.buckets[leaf]
     begin = joined.offsets[leaf]
     start = tables.offsets[leaf]
     place = int(0)
-    empty = int(0)
+    filled = int(0)
+    total = float(0.0)
     for bucket in range(buckets):
         held = int(0)
-        for i in range(joined.counts[leaf]):
-            emitter = joined.entries[begin + i] >> 8
-            if (emitter & (buckets - 1)) == bucket and held < settings.capacity:
+        brought = float(0.0)
+        for i in range(begin, begin + joined.counts[leaf]):
+            emitter = joined.entries[i] >> 8
+            belongs = importances[i] < 0.0
+            if bucket > 0:
+                belongs = not belongs and (emitter & (buckets - 2)) == bucket - 1
+            if belongs and held < settings.capacity:
                 tables.items[start + buckets + place] = emitter
                 place += 1
                 held += 1
+                brought += wp.max(importances[i], 0.0)
+        if bucket == 0:
+            brought = sums[leaf]
         tables.items[start + bucket] = place
-        if held == 0:
-            empty += 1
-    tables.buckets[leaf] = buckets | (empty << 16)
+        tables.chances[start + bucket] = wp.where(held > 0, brought, MAIN)
+        filled += wp.min(held, 1)
+        total += brought
+    sum = float(0.0)
+    for bucket in range(buckets):
+        brought = tables.chances[start + bucket]
+        if brought >= 0.0:
+            share = 1.0 / wp.float32(filled)
+            if total > 0.0:
+                share = LEAST_CHANCE * share + (1.0 - LEAST_CHANCE) * brought / total
+            sum += share
+        tables.chances[start + bucket] = sum
+    # the last bucket that holds anything, and empty ones behind it, end at 1 whatever rounding left
+    for bucket in range(buckets):
+        if tables.chances[start + bucket] >= sum:
+            tables.chances[start + bucket] = 1.0
 
 
 # Thread: a leaf. Its share of exploration: doubled where something new was found, a quarter less where not. A leaf

@@ -103,7 +103,7 @@ class LightShape:
                 square[i] = x[i] * x[i] + y[i] * y[i] + z[i] * z[i];
                 edge = high(edge, dx * dx + dy * dy + dz * dz);
             }
-            const Flags is_small = edge < 0.02f * square[0];
+            const Flags is_small = edge < 0.01f * square[0];
             Lanes value = zero;
             if (__builtin_reduce_or(is_small)) {
                 const Lanes spanned = volume();
@@ -177,7 +177,7 @@ class LightShape:
                 const Triangle lobe = local.rotated(to_lobe);
                 const Flags crosses = (lobe.lowest() <= 0.0f) & (lobe.highest() > 0.0f);
                 const Lanes specular = lobe.highest() <= 0.0f ? zero : lobe.cosine();
-                weight += w.specular * (specular + 1e-3f * cosine);
+                weight += w.specular * specular;
                 left_out |= crosses;
             }
         }

@@ -12,7 +12,7 @@ import warp as wp
 from warp_gi.kernels.alias import alias_choice
 from warp_gi.kernels.emitters import LightChoice
 from warp_gi.kernels.path_samplers import LightSampler
-from warp_gi.kernels.surface import Surface, ray_origin
+from warp_gi.kernels.surface import Surface, ray_origin, shading_normal
 from warp_gi.kernels.types import AliasBucket, SceneData
 
 wp.set_module_options({"enable_backward": False})
@@ -316,8 +316,7 @@ def hierarchy_pdf(tree: LightTree, position: wp.vec3, normal: wp.vec3, item: wp.
 def hierarchy_light(
     data: LightTree, scene: SceneData, region: wp.int32, s: Surface, wo: wp.vec3, u: wp.vec2
 ) -> LightChoice:
-    normal = wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
-    choice = hierarchy_choice(data, ray_origin(s), normal, u[0], u[1])
+    choice = hierarchy_choice(data, ray_origin(s), shading_normal(s), u[0], u[1])
     light = LightChoice()
     light.item = choice.item
     light.pdf = choice.pdf
@@ -328,8 +327,7 @@ def hierarchy_light(
 def hierarchy_light_pdf(
     data: LightTree, scene: SceneData, region: wp.int32, s: Surface, wo: wp.vec3, emitter: wp.int32
 ) -> wp.float32:
-    normal = wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
-    return hierarchy_pdf(data, ray_origin(s), normal, emitter)
+    return hierarchy_pdf(data, ray_origin(s), shading_normal(s), emitter)
 
 
 HIERARCHY_LIGHTS = LightSampler("hierarchy", LightTree, hierarchy_light, hierarchy_light_pdf)

@@ -201,6 +201,20 @@ def place_children(
             child += 1
 
 
+# Centre of a leaf's cell, and half of its diagonal, metres.
+@wp.func
+def leaf_cell(octree: Octree, tree: OctreeNodes, leaf: wp.int32) -> wp.vec4:
+    index = leaf / 8
+    level = tree.levels[index]
+    prefix = tree.prefixes[index] + (wp.uint32(leaf - index * 8) << wp.uint32(TOP_SHIFT - 3 * level))
+    half = 0.5 * wp.float32(1 << (LEVELS - 1 - level))
+    x = wp.float32(gather_bits(prefix)) + half
+    y = wp.float32(gather_bits(prefix >> wp.uint32(1))) + half
+    z = wp.float32(gather_bits(prefix >> wp.uint32(2))) + half
+    center = octree.low + wp.vec3(x, y, z) / octree.scale
+    return wp.vec4(center[0], center[1], center[2], half * 1.7320508 / octree.scale)
+
+
 # Thread: a leaf (or the place of one). Finds the leaves beyond its six faces, x- x+ y- y+ z- z+: -1 where there is
 # none, where cells are smaller, and for places without a leaf.
 @wp.kernel

@@ -43,7 +43,7 @@ class Regions(NamedTuple):
     name: str
     data: Any  # struct
     find: wp.Function  # (data, scene, surface, face, u, v) -> region
-    slot: wp.Function  # (data, path) -> first slot of its samples, or -1: keep none
+    slot: wp.Function  # (data, path: int64) -> first slot of its samples, or -1: keep none
     begin: wp.Function  # (data, slot, surface): a sample at a vertex
     light: wp.Function  # (data, slot, choice, visible)
     direction: wp.Function  # (data, slot, surface, sample, light of the path so far)
@@ -58,14 +58,15 @@ class DirectionSample:
     pdf: wp.float32  # 1/sr; 0 where there is no sample
     bsdf_pdf: wp.float32  # of the BSDF alone
     bsdf_share: wp.float32  # probability of having asked the BSDF
+    reflected: wp.vec3  # what the BSDF alone would have left of the light, as `weight`: goes into roulette
 
 
-# f * cos(wi) / pdf. The colour of a Lambert material may have been looked up after the sample was drawn.
+# A weight of a sample with the colour of a Lambert material, which may have been looked up since it was drawn.
 @wp.func
-def sample_weight(b: Bsdf, sample: DirectionSample) -> wp.vec3:
+def sample_weight(b: Bsdf, weight: wp.vec3) -> wp.vec3:
     if b.f90 <= 0.0:
-        return wp.cw_mul(b.diffuse, sample.weight)
-    return sample.weight
+        return wp.cw_mul(b.diffuse, weight)
+    return weight
 
 
 @wp.struct
@@ -118,6 +119,7 @@ def bsdf_direction(
     r.weight = b.weight
     if s.bsdf.f90 <= 0.0:
         r.weight = wp.vec3(1.0, 1.0, 1.0)
+    r.reflected = r.weight
     return r
 
 
@@ -139,7 +141,7 @@ def no_region(data: NoRegions, scene: SceneData, s: Surface, face: wp.int32, u: 
 
 
 @wp.func
-def no_slot(data: NoRegions, path: wp.int32) -> wp.int32:
+def no_slot(data: NoRegions, path: wp.int64) -> wp.int32:
     return -1
 
 

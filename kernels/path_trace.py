@@ -193,6 +193,8 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
         view = towards_camera
         vertices = int(0)
         throughput = wp.vec3(1.0, 1.0, 1.0)
+        # the same by the BSDF alone: roulette must not end paths for going where light was expected, which lowers it
+        reflected = wp.vec3(1.0, 1.0, 1.0)
         has_sky_map = scene.environment.kind == ENVIRONMENT_MAP
         for depth in range(2, paths.max_depth + 1):
             at_first = depth == 2
@@ -278,7 +280,8 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
             if not goes_on:
                 vertices += 1
                 break
-            throughput = wp.cw_mul(throughput, sample_weight(s.bsdf, b))
+            throughput = wp.cw_mul(throughput, sample_weight(s.bsdf, b.weight))
+            reflected = wp.cw_mul(reflected, sample_weight(s.bsdf, b.reflected))
             if hit.face < 0:
                 if slot >= 0:
                     before = luminance(r.environment + r.indirect)
@@ -310,10 +313,11 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
             if is_last:
                 break
             if depth >= paths.roulette_depth:
-                survival = wp.min(wp.max(throughput), 0.95)
+                survival = wp.min(wp.max(reflected), 0.95)
                 if random_1d(index, seed, d + 6) >= survival:
                     break
                 throughput = throughput / survival
+                reflected = reflected / survival
             view = -wi
             s = surface_shape(scene, hit.face, hit.u, hit.v, view)
         if slot >= 0:
@@ -362,7 +366,8 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
         moment2 = wp.vec3(0.0, 0.0, 0.0)
         first_index = pixel_sample_index(p[0], p[1], settings.first_sample, settings.sample_bits)
         for i in range(settings.sample_count):
-            slot = regions.slot(samplers.regions, (first + wp.tid()) * paths.spp + settings.first_sample + i)
+            path = wp.int64(first + wp.tid()) * wp.int64(paths.spp) + wp.int64(settings.first_sample + i)
+            slot = regions.slot(samplers.regions, path)
             r = trace_path(scene, samplers, hit, s, -direction, paths, first_index + wp.uint32(i), seed, slot)
             brightest = wp.max(r.indirect)
             if paths.clamp > 0.0 and brightest > paths.clamp:

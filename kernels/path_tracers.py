@@ -11,10 +11,14 @@ LIGHTS = (ALIAS_LIGHTS, HIERARCHY_LIGHTS, CACHED_LIGHTS)
 DIRECTIONS = (BSDF_DIRECTIONS, GUIDED_DIRECTIONS)
 
 
+def learns(lights: LightSampler, directions: DirectionSampler) -> bool:
+    """Return whether one of the samplers goes by regions, and learns from the samples kept in them."""
+    return lights is CACHED_LIGHTS or directions is GUIDED_DIRECTIONS
+
+
 def tracer(lights: LightSampler, directions: DirectionSampler) -> PathTracer:
     """Return the path tracer of two samplers, with the regions that they need."""
-    learns = lights is CACHED_LIGHTS or directions is GUIDED_DIRECTIONS
-    return path_tracer(lights, directions, SAMPLE_REGIONS if learns else NO_REGIONS)
+    return path_tracer(lights, directions, SAMPLE_REGIONS if learns(lights, directions) else NO_REGIONS)
 
 
 def every_tracer() -> list[PathTracer]:

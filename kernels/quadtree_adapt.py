@@ -1,17 +1,24 @@
 """Adapting directional quadtrees to the light that arrives: leaves migrate to where most energy is.
 
 Dittebrandt et al. 2020, section 5.1. Each leaf of an octree over the scene has a quadtree (``quadtree``) and a range
-of records of the last frame: a direction and what it contributed. Squared contributions are summed over the
-quadtree's leaves, and while one leaf has by far more than all children of some inner node together, those children
-are given up and that leaf is split.
+of records of the last frame: a direction, its density and what it contributed. Squared contributions are summed over
+the quadtree's leaves, and while one leaf has more to gain from being split than all children of some inner node
+together would lose by being given up, those children go and that leaf is split.
+
+The paper compares sums of c^2. A sample of contribution c = f / p counts as c^2 p here, whose sum estimates the
+integral of f^2 over a leaf however it was sampled, and with it sums of earlier frames, which fade, go on counting. All
+leaves are equally likely, so the density in a leaf of area A is 1 / (n A), and the variance that it causes is
+n A * integral of f^2: that product is what is evened out. (With sums of c^2 of one frame a rare bright sample drew all
+migrations to where it was, and the tree forgot what it had found.)
 """
 
 import warp as wp
 
-from warp_gi.kernels.octahedral import octahedral_encode
+from warp_gi.kernels.octahedral import octahedral_decode, octahedral_encode
 from warp_gi.kernels.quadtree import (
     QUADTREE_LEVELS,
     migrate_block,
+    octahedral_density,
     quadtree_children,
     quadtree_counts,
     quadtree_descend,
@@ -32,17 +39,19 @@ class QuadtreeSamples:
     order: wp.array(dtype=wp.int32)  # record indices
     directions: wp.array(dtype=wp.uint32)  # [record] quadtree_pack_direction
     contributions: wp.array(dtype=wp.float32)  # [record] below 0: no sample
+    pdfs: wp.array(dtype=wp.float32)  # [record] 1/sr
 
 
 @wp.struct
 class QuadtreeAdaptation:
     bits: wp.int32  # 32, 64, 96 or 128
     migrations: wp.int32  # most a frame
-    significance: wp.float32  # a leaf's energy times this must exceed that of the children given up
+    significance: wp.float32  # what a leaf gains, times this, must exceed what is lost by the children given up
+    fading: wp.float32  # share that energies keep from frame to frame
     most_samples: wp.int32  # a leaf; taken evenly from its range
     trees: wp.array(dtype=wp.vec4ui)  # [leaf] in and out
     counts: wp.array(dtype=wp.uint32)  # [leaf * bits / 4] out: quadtree_counts
-    energies: wp.array(dtype=wp.float32)  # [leaf * 4 * bits] scratch: of each quadrant of each node
+    energies: wp.array(dtype=wp.float32)  # [leaf * 4 * bits] in and out: of each quadrant of each node
 
 
 # Octahedral coordinates of a direction, 16 bits each, x in the low half.
@@ -54,6 +63,17 @@ def quadtree_pack_direction(direction: wp.vec3) -> wp.uint32:
     return x | (y << wp.uint32(16))
 
 
+ENOUGH_SAMPLES = wp.constant(256)  # of fewer samples, what was known fades less
+
+
+# Density over the unit square of octahedral coordinates, of one over the sphere; see octahedral_density.
+@wp.func
+def square_density(code: wp.uint32, pdf: wp.float32) -> wp.float32:
+    x = wp.float32(code & wp.uint32(0xFFFF)) / 65536.0
+    y = wp.float32(code >> wp.uint32(16)) / 65536.0
+    return pdf / octahedral_density(octahedral_decode(wp.vec2(x, y)))
+
+
 # Sums squared contributions over quadrants of quadtree leaves; returns whether there was any sample.
 @wp.func
 def add_energies(samples: QuadtreeSamples, adaptation: QuadtreeAdaptation, item: wp.int32, base: wp.int32) -> wp.int32:
@@ -61,6 +81,10 @@ def add_energies(samples: QuadtreeSamples, adaptation: QuadtreeAdaptation, item:
     count = samples.counts[item]
     taken = wp.min(count, adaptation.most_samples)
     found = int(0)
+    weight = (1.0 - adaptation.fading) * wp.min(wp.float32(taken) / wp.float32(ENOUGH_SAMPLES), 1.0)
+    for i in range(base, base + 4 * adaptation.bits):
+        adaptation.energies[i] = adaptation.energies[i] * (1.0 - weight)
+    weight = weight / wp.float32(taken)
     for i in range(taken):
         place = i
         if taken < count:
@@ -70,7 +94,8 @@ def add_energies(samples: QuadtreeSamples, adaptation: QuadtreeAdaptation, item:
         if contribution >= 0.0:
             code = samples.directions[record]
             leaf = quadtree_descend(tree, code << wp.uint32(16), code >> wp.uint32(16) << wp.uint32(16))
-            adaptation.energies[base + 4 * (leaf & 255) + (leaf >> 16)] += contribution * contribution
+            energy = weight * contribution * contribution * square_density(code, samples.pdfs[record])
+            adaptation.energies[base + 4 * (leaf & 255) + (leaf >> 16)] += energy
             found = 1
     return found
 
@@ -78,6 +103,12 @@ def add_energies(samples: QuadtreeSamples, adaptation: QuadtreeAdaptation, item:
 @wp.func
 def sum_of_four(values: wp.array(dtype=wp.float32), i: wp.int32) -> wp.float32:
     return (values[i] + values[i + 1]) + (values[i + 2] + values[i + 3])
+
+
+# End of the level that begins with node k: where the children of its first inner node begin.
+@wp.func
+def level_end(tree: wp.vec4ui, bits: wp.int32, k: wp.int32) -> wp.int32:
+    return wp.min(quadtree_children(tree, k), bits)
 
 
 # Energy of four leaves, of which `child` is the first.
@@ -89,28 +120,55 @@ def energy_of_children(energies: wp.array(dtype=wp.float32), base: wp.int32, chi
     )
 
 
-# The leaf of most energy among those that may be split, or -1; the first of equals.
+# A leaf, and what there is to gain by splitting it.
+@wp.struct
+class Leaf:
+    node: wp.int32  # -1: there is none
+    gain: wp.float32
+
+
+# The leaf that gains most by being split, among those that may be; the first of equals.
 @wp.func
-def brightest_leaf(tree: wp.vec4ui, bits: wp.int32, energies: wp.array(dtype=wp.float32), base: wp.int32) -> wp.int32:
-    best = int(-1)
-    most = float(-1.0)
+def brightest_leaf(tree: wp.vec4ui, bits: wp.int32, energies: wp.array(dtype=wp.float32), base: wp.int32) -> Leaf:
+    best = Leaf()
+    best.node = -1
+    best.gain = -1.0
+    area = float(1.0)
+    end = int(0)
     for k in range(quadtree_level_start(tree, bits, QUADTREE_LEVELS)):
-        energy = sum_of_four(energies, base + 4 * k)
-        if quadtree_is_inner(tree, k) == 0 and energy > most:
-            most = energy
-            best = k
+        if k == end:
+            area = area * 0.25
+            end = level_end(tree, bits, k)
+        if quadtree_is_inner(tree, k) == 0:
+            gain = area * sum_of_four(energies, base + 4 * k)
+            if gain > best.gain:
+                best.gain = gain
+                best.node = k
     return best
 
 
-# The inner node with only leaves as children, but not `leaf`, whose children have least energy, or -1.
+# What is lost if the children of inner node k, the first of which is `child`, are given up for one leaf.
+@wp.struct
+class Twig:
+    node: wp.int32  # -1: there is none
+    loss: wp.float32
+
+
+# The inner node with only leaves as children, but not `leaf`, that loses least without them; the first of equals.
 @wp.func
 def darkest_twig(
     tree: wp.vec4ui, bits: wp.int32, energies: wp.array(dtype=wp.float32), base: wp.int32, leaf: wp.int32
-) -> wp.int32:
-    best = int(-1)
-    least = float(LARGEST_FLOAT)
+) -> Twig:
+    best = Twig()
+    best.node = -1
+    best.loss = LARGEST_FLOAT
+    area = float(1.0)
+    end = int(0)
     child = int(4)  # first child of the next inner node
     for k in range(bits):
+        if k == end:
+            area = area * 0.25
+            end = level_end(tree, bits, k)
         if quadtree_is_inner(tree, k) != 0:
             inner_children = (
                 quadtree_is_inner(tree, child)
@@ -119,10 +177,10 @@ def darkest_twig(
                 + quadtree_is_inner(tree, child + 3)
             )
             if inner_children == 0 and child != (leaf & ~3):
-                energy = energy_of_children(energies, base, child)
-                if energy < least:
-                    least = energy
-                    best = k
+                loss = area * energy_of_children(energies, base, child)
+                if loss < best.loss:
+                    best.loss = loss
+                    best.node = k
             child += 4
     return best
 
@@ -160,22 +218,16 @@ def adapt_quadtrees(first: wp.int32, samples: QuadtreeSamples, adaptation: Quadt
     item = first + wp.tid()
     bits = adaptation.bits
     base = 4 * bits * item
-    if samples.counts[item] > 0:
-        for i in range(4 * bits):
-            adaptation.energies[base + i] = 0.0
-        if add_energies(samples, adaptation, item, base) != 0:
-            tree = adaptation.trees[item]
-            for _i in range(adaptation.migrations):
-                leaf = brightest_leaf(tree, bits, adaptation.energies, base)
-                inner = darkest_twig(tree, bits, adaptation.energies, base, leaf)
-                if leaf < 0 or inner < 0:
-                    break
-                energy = sum_of_four(adaptation.energies, base + 4 * leaf)
-                removed = quadtree_children(tree, inner)
-                if not energy * adaptation.significance > energy_of_children(adaptation.energies, base, removed):
-                    break
-                inserted = quadtree_migrated_children(tree, leaf, inner)
-                migrate_energies(adaptation.energies, base, leaf, inner, removed, inserted)
-                tree = migrate_block(tree, leaf, inner, removed, inserted)
-            adaptation.trees[item] = tree
+    if samples.counts[item] > 0 and add_energies(samples, adaptation, item, base) != 0:
+        tree = adaptation.trees[item]
+        for _i in range(adaptation.migrations):
+            leaf = brightest_leaf(tree, bits, adaptation.energies, base)
+            twig = darkest_twig(tree, bits, adaptation.energies, base, leaf.node)
+            if leaf.node < 0 or twig.node < 0 or not leaf.gain * adaptation.significance > twig.loss:
+                break
+            removed = quadtree_children(tree, twig.node)
+            inserted = quadtree_migrated_children(tree, leaf.node, twig.node)
+            migrate_energies(adaptation.energies, base, leaf.node, twig.node, removed, inserted)
+            tree = migrate_block(tree, leaf.node, twig.node, removed, inserted)
+        adaptation.trees[item] = tree
     quadtree_counts(adaptation.trees[item], bits, adaptation.counts, (bits >> 2) * item)

@@ -32,6 +32,7 @@ class SampleRecords:
     lights: wp.array(dtype=wp.uint32)  # LIGHT_*
     directions: wp.array(dtype=wp.uint32)  # quadtree_pack_direction
     contributions: wp.array(dtype=wp.float32)  # luminance that came to the picture that way, but for emitters it hit
+    pdfs: wp.array(dtype=wp.float32)  # 1/sr, of the direction
     mixtures: wp.array(dtype=wp.uint32)  # share of the BSDF in the density there (16 bits), and of asking it (<< 16)
     vertices: wp.int32  # slots of a path
     stride: wp.int32
@@ -57,12 +58,12 @@ def sample_region(
 
 
 @wp.func
-def sample_slot(data: SampleRegions, path: wp.int32) -> wp.int32:
-    group = path / data.records.stride
-    turn = wp.int32(hash_uint(wp.uint32(group) ^ data.records.seed) % wp.uint32(data.records.stride))
-    if path - group * data.records.stride != turn:
+def sample_slot(data: SampleRegions, path: wp.int64) -> wp.int32:
+    group = path / wp.int64(data.records.stride)
+    turn = hash_uint(wp.uint32(group) ^ data.records.seed) % wp.uint32(data.records.stride)
+    if path - group * wp.int64(data.records.stride) != wp.int64(turn):
         return -1
-    return group * data.records.vertices
+    return wp.int32(group) * data.records.vertices
 
 
 @wp.func
@@ -93,6 +94,7 @@ def keep_direction(data: SampleRegions, slot: wp.int32, s: Surface, sample: Dire
     share = wp.uint32(sample.bsdf_share * 65535.0 + 0.5)
     data.records.mixtures[slot] = wp.uint32(posterior * 65535.0 + 0.5) | (share << wp.uint32(16))
     data.records.contributions[slot] = light
+    data.records.pdfs[slot] = sample.pdf
 
 
 @wp.func

@@ -247,6 +247,11 @@ def surface_at(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, w
     return with_color(scene, surface_shape(scene, face, u, v, wo))
 
 
+@wp.func
+def shading_normal(s: Surface) -> wp.vec3:
+    return wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
+
+
 # Where a ray starts that leaves the surface to the side of `normal`.
 @wp.func
 def ray_origin(s: Surface) -> wp.vec3:

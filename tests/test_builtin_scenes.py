@@ -7,12 +7,21 @@ import pytest
 
 import warp_gi as gi
 from warp_gi.errors import OptionError
-from warp_gi.scene.builtin import BUILTIN_SCENES, architecture, builtin_camera_path, materials, shapes, sphere_row
+from warp_gi.scene.builtin import (
+    BUILTIN_SCENES,
+    architecture,
+    builtin_camera_path,
+    materials,
+    mine,
+    shapes,
+    sphere_row,
+)
 from warp_gi.scene.builtin import textures as tx
 
 TRIANGLES = {
     "atrium": (140_000, 180_000),
     "cornell_box": (30, 60),
+    "mine": (60_000, 100_000),
     "sphere_row": (10_000, 40_000),
     "street": (100_000, 150_000),
     "two_rooms": (500, 10_000),
@@ -172,6 +181,45 @@ def test_open_scenes_show_sky_above_only(name):
     assert 0.05 < sky.mean() < 0.5
     assert directions[sky, 1].min() > -0.05
     assert scene.environment is not None and not scene.environment.is_black
+
+
+def test_mine_is_closed_but_for_a_shaft_towards_the_sun():
+    scene = gi.builtin_scene("mine")
+    bvh, directions = bvh_of(scene), fibonacci(4096)
+    assert scene.emitter_count == 0 and {"main", "spot", "tunnel"} <= set(scene.cameras)
+    for camera in scene.cameras.values():
+        origins = np.repeat(camera.position[None].astype(np.float32), len(directions), axis=0)
+        t = bvh.intersect(origins, directions).t.numpy()
+        assert np.isinf(t).mean() < 0.005
+        ends = (origins + t[:, None] * directions)[np.isfinite(t)]
+        assert (ends > mine.LOW).all() and (ends < mine.HIGH).all()
+    for origin in np.random.default_rng(0).uniform((-4, 0.8, -4), (4, 3, 4), (32, 3)).astype(np.float32):
+        sky = np.isinf(bvh.intersect(np.repeat(origin[None], len(directions), axis=0), directions).t.numpy())
+        assert sky.mean() < 0.06
+        assert (directions[sky] @ mine.to_sun() > 0.5).all()
+
+
+def test_mine_has_a_small_sunlit_spot():
+    bvh = bvh_of(gi.builtin_scene("mine"))
+    (center_x, _, center_z), (radius_x, _, radius_z) = mine.CAVERN
+    x, z = np.meshgrid(np.arange(-8, 8, 0.1) + center_x, np.arange(-7, 7, 0.1) + center_z)
+    inside = np.hypot((x - center_x) / radius_x, (z - center_z) / radius_z) < 0.85
+    height = 0.5  # m above the ground
+    origins = np.stack([x, np.full_like(x, height), z], axis=-1)[inside].astype(np.float32)
+    sun = np.broadcast_to(mine.to_sun().astype(np.float32), origins.shape)
+    lit = bvh.occluded(origins, np.ascontiguousarray(sun)).numpy() == 0
+    assert 1.0 < lit.sum() * 0.1**2 < 8.0  # m^2
+    axis = mine.SPOT + height / mine.to_sun()[1] * mine.to_sun()
+    assert (np.linalg.norm(origins[lit] - axis, axis=1) > 2.0).mean() < 0.01  # a few start inside of the rock
+
+
+def test_rock_faces_where_one_can_be():
+    x = np.linspace(-2, 2, 21, dtype=np.float32)
+    values = 1.3 - np.sqrt(x[:, None, None] ** 2 + x[:, None] ** 2 + x**2)  # a ball of rock in the air
+    points, faces = mine.surface(values, 0.2)
+    ball = shapes.Shape.of(points - 2, faces, crease=180.0)
+    assert shapes.volume(ball) == pytest.approx(4 / 3 * math.pi * 1.3**3, rel=0.03)
+    assert np.allclose(np.linalg.norm(ball.points, axis=1), 1.3, atol=0.03)
 
 
 def test_sphere_row_takes_its_settings():

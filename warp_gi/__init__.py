@@ -44,6 +44,7 @@ _PUBLIC = {
     "VisibilityLightCache": "warp_gi.techniques.visibility_light_cache",
     "GuidedPaths": "warp_gi.techniques.guided_paths",
     "SampleOctree": "warp_gi.techniques.sample_octree",
+    "reuse_pictures": "warp_gi.techniques.reuse_pictures",
     "VisibilityField": "warp_gi.techniques.visibility_field",
     "LightFieldProbes": "warp_gi.techniques.light_field_probes",
     "Denoiser": "warp_gi.denoise",

@@ -28,7 +28,7 @@ from warp_gi.pipeline import TERMS, Estimator, Pipeline
 from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.environment import Environment
 from warp_gi.scene.scene import Scene
-from warp_gi.scheduler import FrameScheduler
+from warp_gi.scheduler import Frame, FrameScheduler
 from warp_gi.sequence import (
     frame_attributes,
     frame_path,
@@ -38,6 +38,7 @@ from warp_gi.sequence import (
     write_frame,
     write_preview,
 )
+from warp_gi.techniques.reuse_pictures import check_pictures, reuse_pictures
 
 DESCRIPTION = """Render a sequence of frames to EXR files with named layers, and PNG previews.
 
@@ -50,6 +51,7 @@ all: stop with Ctrl-C or kill the process at any time, and carry on with --resum
   warp-gi render hall.glb --pipeline dvf --bake out/hall.dvf.safetensors --environment-turn 2
   warp-gi render hall.glb --pipeline probes --denoise spatiotemporal
   warp-gi render out/hall.probes.safetensors --camera path.json
+  warp-gi render warehouse --pipeline reuse --reuse-pictures out/reuse --reuse-pixel 320 300
   warp-gi render cornell_box --pipeline path,emitters=UniformLights --indirect.max-depth 4"""
 
 BAKE_SUFFIX = ".safetensors"
@@ -89,6 +91,11 @@ class Render(SceneOptions):
     """Write a tone-mapped PNG beside each frame."""
     exposure: float = 0.0
     """Of previews, in stops."""
+    reuse_pictures: Annotated[Path | None, flag("FOLDER", "none")] = None
+    """Write pictures of what the last frame's samples taught: the octree's leaves, samples and lights in them, shares
+    of exploration and of the BSDF. The pipeline has to learn, as reuse and hybrid do."""
+    reuse_pixel: Annotated[tuple[int, int] | None, flag("X Y", "none")] = None
+    """Add the quadtree of what this pixel sees, beside the light that comes there. 0 0 is at the top left."""
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print nothing but errors."""
     verbose: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -177,6 +184,8 @@ def _subclasses(base: type) -> list[type]:
 
 def run(options: Render, report: Reporter) -> None:
     """Render what the options say."""
+    if options.reuse_pixel is not None and options.reuse_pictures is None:
+        raise OptionError("--reuse-pixel goes with --reuse-pictures; give that too")
     resolution = parse_resolution(options.resolution) if options.resolution else None
     bakes = [load_bake(path) for path in options.bake]
     with report.phase("scene"):
@@ -201,6 +210,8 @@ def run(options: Render, report: Reporter) -> None:
     turn_sky(options, scene, sky, shots[0].index)
     source = scene.bake if isinstance(scene, BakedScene) else scene
     scheduler = FrameScheduler(source, camera, options.settings, options.device, options.seed, report.stage, bakes)
+    if options.reuse_pictures is not None:
+        check_pictures(scheduler, shots[-1].camera, options.reuse_pixel)
     with report.phase("bake"):
         scheduler.bake()
     done, lineages = [], []
@@ -218,6 +229,10 @@ def run(options: Render, report: Reporter) -> None:
         if len(todo) == len(shots):
             reason = reason or "no saved state fits, and light is learnt"
             report.line(f"every frame is rendered again: {reason} by the frames before")
+    if options.reuse_pictures is not None:
+        if not todo:
+            raise OptionError("--reuse-pictures needs a frame to render, and all are there already; leave --resume out")
+        check_writable(options.reuse_pictures)
     if todo:
         check_writable(options.output.parent)
     if len(todo) < len(shots):
@@ -228,10 +243,15 @@ def run(options: Render, report: Reporter) -> None:
         with stoppable() as stop, report.bar(len(todo)):
             for shot in todo:
                 turn_sky(options, scene, sky, shot.index)
-                for stage, seconds in render_shot(options, shot, scheduler, report).items():
+                frame, stages = render_shot(options, shot, scheduler, report)
+                for stage, seconds in stages.items():
                     times.setdefault(stage, []).append(seconds)
                 if scheduler.learns:
                     scheduler.save_state(state_path(options), lineages[shots.index(shot)])
+                if options.reuse_pictures is not None and shot is todo[-1]:
+                    reuse_pictures(scheduler, frame, options.reuse_pictures, options.reuse_pixel)
+                    report.line(f"pictures: {options.reuse_pictures}")
+                del frame  # before there is a next one
                 if stop.is_set():
                     raise KeyboardInterrupt
     except KeyboardInterrupt:
@@ -244,8 +264,10 @@ def run(options: Render, report: Reporter) -> None:
         report.table("seconds by stage", ("stage", "first frame", "mean", "largest", "sum"), rows)
 
 
-def render_shot(options: Render, shot: Shot, scheduler: FrameScheduler, report: Reporter) -> dict[str, float]:
-    """Render a frame, write it, and return the seconds of its stages."""
+def render_shot(
+    options: Render, shot: Shot, scheduler: FrameScheduler, report: Reporter
+) -> tuple[Frame, dict[str, float]]:
+    """Render a frame and write it; return it, and the seconds of its stages."""
     remove_stale_parts(shot.path)
     started, compiled = time.perf_counter(), launch.compile_seconds
     frame = scheduler.frame(shot.index, shot.previous)
@@ -256,7 +278,7 @@ def render_shot(options: Render, shot: Shot, scheduler: FrameScheduler, report: 
     seconds = finished - started - compiled
     note = f" and {compiled:.1f} s compiling kernels" if compiled > 0.5 else ""
     report.frame(f"{shot.path} {seconds:.2f} s{note}", seconds)
-    return {**frame.timings, "write": finished - rendered}
+    return frame, {**frame.timings, "write": finished - rendered}
 
 
 @contextmanager

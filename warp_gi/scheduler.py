@@ -321,7 +321,8 @@ class FrameScheduler:
                 self._states[term] = estimator.preprocess(frame, self._states[term])
         if self._light_sampler is not None:
             self._states["lights"] = self._light_sampler.preprocess(frame, self._states.get("lights"))
-        if self._learners:
+        learns = path_tracers.learns(frame.lights.sampler, frame.directions.sampler)  # not so without any lights
+        if learns:
             with frame.stage("preprocess octree"):
                 self._open_records(frame)
         views = self.pipeline.camera_sample_count
@@ -330,7 +331,7 @@ class FrameScheduler:
             self._progress("trace", (view + 1) / views)
         with frame.stage("compose"):
             frame.launch(compose.compose_frame, [views, self.pipeline.spp, frame.struct(compose.FrameSums)])
-        if self._learners:
+        if learns:
             self._learn(frame)
         if self.pipeline.denoise is not None:
             with frame.stage("denoise"):

@@ -31,15 +31,18 @@ class GuidedPaths(BsdfPaths):
     """Of one quadtree: 32, 64, 96 or 128."""
     migrations: int = 8
     """Leaves of a quadtree that may move in a frame; 1 in the paper."""
-    significance: float = 0.1
+    significance: float = 0.5
     """Leaves move only where the squared light of one, times this, exceeds that of the four given up."""
+    fading: float = 0.8
+    """Share that the light of earlier frames keeps in what a quadtree adapts to; 0 is the last frame alone, as in
+    the paper."""
     bsdf_share: float = 0.5
     """Share of directions by the BSDF: the first one, and the only one unless ``adapts_share``."""
     adapts_share: bool = True
     """Whether each region learns the share that its samples would have varied least with."""
     stratified: bool = True
     """Whether two numbers are warped top-down, which keeps them stratified, or a third picks a leaf as in the paper."""
-    samples: int = 4096
+    samples: int = 2048
     """Samples a region that are looked at, each frame."""
 
     def validate(self) -> None:
@@ -50,6 +53,8 @@ class GuidedPaths(BsdfPaths):
         for name, low, high in (("migrations", 0, 32), ("samples", 1, 1 << 24)):
             if not low <= getattr(self, name) <= high:
                 raise OptionError(f"{name} must be from {low} to {high}, got {getattr(self, name)}")
+        if not 0.0 <= self.fading < 1.0:
+            raise OptionError(f"fading must be from 0 to below 1, got {self.fading}")
         if not 0.0 <= self.significance <= 1.0:
             raise OptionError(f"significance must be from 0 to 1, got {self.significance}")
         if not 0.02 <= self.bsdf_share <= 0.98:
@@ -67,7 +72,7 @@ class GuidedPaths(BsdfPaths):
     def start(self, scene: Any, device: str, bake: Any, seed: int = 0) -> GuideState:
         """Return even quadtrees for the eight leaves of the first octree."""
         device = launch.get_device(device)
-        guides = _guides(8, device)
+        guides = _guides(8, self.bits, device)
         guides.trees.fill_(wp.vec4ui(*quadtree.quadtree_uniform(self.bits)))
         guides.shares.fill_(wp.vec2(self.bsdf_share, self.bsdf_share))
         return self._counted(guides, device)
@@ -83,7 +88,7 @@ class GuidedPaths(BsdfPaths):
     def learn(self, lesson: Lesson, state: GuideState) -> GuideState:
         """Adapt the quadtrees to the samples of the frame."""
         device = lesson.device
-        guides = _guides(lesson.octree.leaf_count, device)
+        guides = _guides(lesson.octree.leaf_count, self.bits, device)
         uniform = wp.vec4ui(*quadtree.quadtree_uniform(self.bits))
         inputs = [lesson.origins, state.guides, guides, uniform, self.bsdf_share]
         lesson.launch(guided_shares.take_over_guides, inputs, 256)
@@ -93,7 +98,8 @@ class GuidedPaths(BsdfPaths):
         adaptation = self._adaptation(guides, device)
         records = quadtree_adapt.QuadtreeSamples()
         records.starts, records.counts, records.order = samples.starts, samples.counts, samples.order
-        records.directions, records.contributions = lesson.records.directions, lesson.records.contributions
+        for name in ("directions", "contributions", "pdfs"):
+            setattr(records, name, getattr(lesson.records, name))
         lesson.launch(quadtree_adapt.adapt_quadtrees, [records, adaptation])
         return GuideState(guides, adaptation.counts)
 
@@ -104,7 +110,7 @@ class GuidedPaths(BsdfPaths):
         adaptation.significance, adaptation.most_samples = self.significance, self.samples
         adaptation.trees = guides.trees
         adaptation.counts = wp.empty(leaves * self.bits // 4, dtype=wp.uint32, device=device)
-        adaptation.energies = wp.empty(leaves * 4 * self.bits, dtype=wp.float32, device=device)
+        adaptation.energies, adaptation.fading = guides.energies, self.fading
         return adaptation
 
     def _counted(self, guides: guided_shares.GuideKnowledge, device: wp.Device) -> GuideState:
@@ -126,9 +132,10 @@ class GuideState:
     """uint32 [leaf * bits / 4], which follows from the trees."""
 
 
-def _guides(leaves: int, device: wp.Device) -> guided_shares.GuideKnowledge:
+def _guides(leaves: int, bits: int, device: wp.Device) -> guided_shares.GuideKnowledge:
     guides = guided_shares.GuideKnowledge()
     guides.trees = wp.empty(leaves, dtype=wp.vec4ui, device=device)
     guides.shares = wp.empty(leaves, dtype=wp.vec2, device=device)
     guides.moments = wp.zeros(2 * leaves, dtype=guided_shares.ShareMoments, device=device)
+    guides.energies = wp.zeros(leaves * 4 * bits, dtype=wp.float32, device=device)
     return guides

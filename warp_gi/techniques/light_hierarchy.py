@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -29,17 +29,9 @@ class LightHierarchy(Estimator):
 
     def preprocess(self, frame: Any, state: TreeState | None) -> TreeState | None:
         """Bring the tree up to the frame's lights, and give it to the paths."""
-        if frame.scene.emitter_count == 0:
-            return None
+        state = tree_of(frame, state)
         if state is None:
-            bounds = light_tree.emitter_bounds(frame.scene, frame.data)
-            tree = light_tree.build_tree(bounds)
-            state = TreeState(tree, bounds, light_tree.to_device(tree, frame.device))
-        elif frame.scene.is_animated:
-            bounds = light_tree.emitter_bounds(frame.scene, frame.data)
-            if not _same(bounds, state.bounds):
-                tree = light_tree.refit_tree(state.tree, bounds)
-                state = replace(state, tree=tree, bounds=bounds, data=light_tree.to_device(tree, frame.device))
+            return None
         frame.lights = SamplerInUse(light_hierarchy.HIERARCHY_LIGHTS, state.data)
         return state
 
@@ -55,6 +47,22 @@ class TreeState:
     tree: light_tree.TreeArrays
     bounds: light_tree.EmitterBounds
     data: light_hierarchy.LightTree
+
+
+def tree_of(frame: Any, state: TreeState | None) -> TreeState | None:
+    """Return the tree over a frame's lights, from that of the frame before; None if there are none."""
+    if frame.scene.emitter_count == 0:
+        return None
+    if state is None:
+        bounds = light_tree.emitter_bounds(frame.scene, frame.data)
+        tree = light_tree.build_tree(bounds)
+        return TreeState(tree, bounds, light_tree.to_device(tree, frame.device))
+    if frame.scene.is_animated:
+        bounds = light_tree.emitter_bounds(frame.scene, frame.data)
+        if not _same(bounds, state.bounds):
+            tree = light_tree.refit_tree(state.tree, bounds)
+            return TreeState(tree, bounds, light_tree.to_device(tree, frame.device))
+    return state
 
 
 def _same(a: light_tree.EmitterBounds, b: light_tree.EmitterBounds) -> bool:

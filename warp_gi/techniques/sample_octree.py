@@ -13,6 +13,7 @@ from warp_gi.errors import OptionError
 from warp_gi.kernels import gbuffer, octree, samples
 from warp_gi.kernels.light_cache_build import LeafSamples
 
+MOST_SAMPLES = 1 << 28
 MOST_CELLS = 1 << 24  # offsets of inner nodes have 24 bits
 
 
@@ -24,17 +25,20 @@ class SampleOctree:
     given up where it holds fewer than ``collapse`` (temporal_reuse.txt, section 6).
     """
 
-    split: int = 4096
+    split: int = 1024
     """Samples of a frame above which a leaf is split."""
-    collapse: int = 2048
+    collapse: int = 512
     """Samples of a frame below which an inner node becomes a leaf."""
     most_samples: int = 1 << 20
-    """Samples that are kept of a frame at most, 20 bytes each; of more paths, every second, third ... is recorded."""
+    """Samples that are kept of a frame at most, 24 bytes each; of more paths, every second, third ... is recorded."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.collapse <= self.split:
-            raise OptionError(f"octree: collapse must be from 1 to split ({self.split}), got {self.collapse}")
-        if not 1024 <= self.most_samples <= 1 << 28:
+        if not 1 <= self.collapse <= self.split <= MOST_SAMPLES:
+            raise OptionError(
+                f"octree: collapse must be from 1 to split, and split at most {MOST_SAMPLES:,}, "
+                f"got {self.collapse} and {self.split}"
+            )
+        if not 1024 <= self.most_samples <= MOST_SAMPLES:
             raise OptionError(f"octree: most_samples must be from 1,024 to 2^28, got {self.most_samples}")
 
     def start(self, scene: Any, device: wp.Device) -> OctreeState:
@@ -60,7 +64,8 @@ class SampleOctree:
         else:
             for name in ("codes", "lights", "directions", "mixtures"):
                 setattr(records, name, wp.empty(slots, dtype=wp.uint32, device=frame.device))
-            records.contributions = wp.empty(slots, dtype=wp.float32, device=frame.device)
+            for name in ("contributions", "pdfs"):
+                setattr(records, name, wp.empty(slots, dtype=wp.float32, device=frame.device))
         records.codes.fill_(0xFFFFFFFF)
         records.vertices, records.stride, records.seed = vertices, stride, frame.seed
         return records
@@ -80,7 +85,7 @@ class SampleOctree:
         grouped = LeafSamples()
         grouped.starts, grouped.counts, grouped.order = tree.starts, counts, slots
         grown = OctreeState(cube, tree.prefixes, tree.levels, tree.counts)
-        return Lesson(grown, records, grouped, neighbours, origins, device)
+        return Lesson(grown, tree, records, grouped, neighbours, origins, device)
 
     def _build(self, state: OctreeState, codes: wp.array, device: wp.Device) -> tuple[octree.OctreeNodes, int]:
         """Return the nodes, level by level, and how many there are."""
@@ -136,6 +141,7 @@ class Lesson:
     """What a frame's samples have to teach: they, sorted by the leaves of the tree that fits them."""
 
     octree: OctreeState
+    tree: octree.OctreeNodes
     records: samples.SampleRecords
     samples: LeafSamples
     """``most`` is for each technique to set."""
@@ -173,7 +179,8 @@ def _listed(records: samples.SampleRecords, device: wp.Device) -> tuple[wp.array
     count = int(ends[chunks - 1 : chunks].numpy()[0])
     codes = wp.empty(2 * count, dtype=wp.int32, device=device)  # sorting needs as much again
     slots = wp.empty(2 * count, dtype=wp.int32, device=device)
-    if count:
-        launch.launch(samples.list_samples, chunks, [records, ends, codes, slots], device, 16)
-        wp.utils.radix_sort_pairs(codes, slots, count)
+    if count == 0:
+        return codes, slots
+    launch.launch(samples.list_samples, chunks, [records, ends, codes, slots], device, 16)
+    wp.utils.radix_sort_pairs(codes, slots, count)
     return codes[:count], slots[:count]

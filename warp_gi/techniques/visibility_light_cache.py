@@ -10,11 +10,15 @@ import warp as wp
 
 from warp_gi import launch
 from warp_gi.alias import AliasTable
-from warp_gi.errors import OptionError
+from warp_gi.errors import OptionError, unknown_name
 from warp_gi.estimator import Estimator, SamplerInUse
 from warp_gi.kernels import light_cache, light_cache_build, light_cache_native, path_trace, types
+from warp_gi.techniques.light_hierarchy import TreeState, tree_of
 from warp_gi.techniques.ltc import ltc_table
 from warp_gi.techniques.sample_octree import Lesson, running_sums
+
+EXPLORES_BY = ("hierarchy", "table")
+MOST_EMITTERS = 1 << 23  # entries of lists have 23 bits for them
 
 
 @dataclass(frozen=True)
@@ -31,16 +35,19 @@ class VisibilityLightCache(Estimator):
     """Lights a bucket at most, 1 to 32; more lights go to more buckets, of which a sample weighs one."""
     exploration: float = 0.1
     """Share of samples that explore, at most, in (0, 1]."""
-    least_exploration: float = 0.02
+    least_exploration: float = 0.05
     """Share that it falls to where nothing new is found; as ``exploration``, it stays."""
-    memory: int = 4
+    memory: int = 8
     """Frames that a light stays in a region after it was last seen, 0 to 200."""
+    explores_by: str = "hierarchy"
+    """How lights are explored: by the "hierarchy" over all of them, or by a "table" of the three weights below, as in
+    the paper, the same at every point."""
     energy: float = 1.0
-    """Weight of a light's power in exploration."""
+    """Weight of a light's power in exploration by the table."""
     change: float = 1.0
-    """Weight in exploration of how far a light moved, times its power."""
+    """Weight in the table of how far a light moved, times its power."""
     distance: float = 1.0
-    """Weight in exploration of a light's nearness to the camera."""
+    """Weight in the table of a light's nearness to the camera."""
     samples: int = 2048
     """Samples a region that are looked at, each frame."""
 
@@ -60,9 +67,13 @@ class VisibilityLightCache(Estimator):
                 f"least_exploration must be above 0 and at most exploration ({self.exploration}), "
                 f"got {self.least_exploration}"
             )
+        if self.explores_by not in EXPLORES_BY:
+            raise unknown_name("way to explore", self.explores_by, EXPLORES_BY)
         weights = (self.energy, self.change, self.distance)
-        if not (min(weights) >= 0.0 and max(weights) > 0.0 and np.isfinite(weights).all()):
-            raise OptionError(f"energy, change and distance must not be negative, and one above 0, got {weights}")
+        if not (min(weights) >= 0.0 and max(self.energy, self.distance) > 0.0 and np.isfinite(weights).all()):
+            raise OptionError(
+                f"energy, change and distance must not be negative, and energy or distance above 0, got {weights}"
+            )
 
     @property
     def learns(self) -> bool:
@@ -77,6 +88,11 @@ class VisibilityLightCache(Estimator):
         """Return empty caches for the eight leaves of the first octree."""
         if scene.emitter_count == 0:
             return None
+        if scene.emitter_count > MOST_EMITTERS:
+            raise OptionError(
+                f"VisibilityLightCache takes up to {MOST_EMITTERS:,} emitters, {scene.name} has "
+                f"{scene.emitter_count:,}; use LightHierarchy"
+            )
         device = launch.get_device(device)
         centers = _places(scene.data(device))[0]
         return CacheState(_tables(8, device, self.exploration), _lists(8, device), centers)
@@ -96,23 +112,31 @@ class VisibilityLightCache(Estimator):
             shapes = wp.empty(len(centers), dtype=light_cache_native.LightShape, device=device)
             inputs = [frame.data, launch.on_device(luminances, wp.float32, device), shapes]
             frame.launch(light_cache.shape_lights, inputs, len(centers))
-            state = replace(state, centers=centers, shapes=shapes)
+            state = replace(state, centers=centers, shapes=shapes, emitters=emitters.emitters)
         if moved.any():  # what is known is in doubt everywhere
             tables = launch.copied(state.tables, light_cache.CacheTables)
             leaves = tables.buckets.shape[0]
             tables.exploration = wp.full(leaves, self.exploration, dtype=wp.float32, device=device)
             state = replace(state, tables=tables)
-        near = 1.0 / (_distances(centers, frame.camera.position) ** 2 + (0.02 * scene.radius) ** 2)
+        cache = light_cache.LightCache()
+        cache.shapes, cache.emitters = state.shapes, state.emitters
+        cache.ltc, cache.tables = ltc_table(device), state.tables
+        if self.explores_by == "hierarchy":
+            state = replace(state, tree=tree_of(frame, state.tree))
+            cache.explores_by_tree, cache.tree = 1, state.tree.data
+        else:
+            emitters.alias = AliasTable.build(self._table(frame, powers, moved, centers)).on(device)
+        frame.lights = SamplerInUse(light_cache.CACHED_LIGHTS, cache)
+        return state
+
+    def _table(self, frame: Any, powers: np.ndarray, moved: np.ndarray, centers: np.ndarray) -> np.ndarray:
+        """Return the relative probabilities of exploring each light (section 4.3)."""
+        near = 1.0 / (_distances(centers, frame.camera.position) ** 2 + (0.02 * frame.scene.radius) ** 2)
         weights = np.zeros(len(powers))
         for share, part in ((self.energy, powers), (self.change, powers * moved), (self.distance, near * (powers > 0))):
             if part.sum() > 0:
                 weights += share * part / part.sum()
-        emitters.alias = AliasTable.build(weights).on(device)
-        cache = light_cache.LightCache()
-        cache.shapes, cache.emitters = state.shapes, emitters.emitters
-        cache.ltc, cache.tables = ltc_table(device), state.tables
-        frame.lights = SamplerInUse(light_cache.CACHED_LIGHTS, cache)
-        return state
+        return weights
 
     def trace(self, frame: Any, state: Any) -> None:
         """Ask the shared path launch for this term."""
@@ -140,15 +164,23 @@ class VisibilityLightCache(Estimator):
         joined.entries = wp.zeros(size, dtype=wp.int32, device=device)
         lesson.launch(light_cache_build.join_lights, [*around, joined, self.memory])
 
+        lights = light_cache.LightCache()
+        lights.shapes, lights.emitters = state.shapes, state.emitters
+        importances = wp.empty(size, dtype=wp.float32, device=device)
+        sums = wp.empty(leaves, dtype=wp.float32, device=device)
+        octree = lesson.octree.octree
+        inputs = [lights, octree, lesson.tree, joined, self.capacity, importances, sums]
+        lesson.launch(light_cache_build.rank_lights, inputs)
         tables, sizes = _tables(leaves, device, self.exploration), wp.empty(leaves, dtype=wp.int32, device=device)
-        inputs = [settings, joined, origins, state.tables, tables, sizes]
+        inputs = [settings, joined, importances, origins, state.tables.buckets, tables.buckets, sizes]
         lesson.launch(light_cache_build.count_buckets, inputs)
         tables.offsets, size = running_sums(sizes)
         tables.items = wp.zeros(size, dtype=wp.int32, device=device)
-        lesson.launch(light_cache_build.fill_buckets, [settings, joined, tables])
+        tables.chances = wp.zeros(size, dtype=wp.float32, device=device)
+        lesson.launch(light_cache_build.fill_buckets, [settings, joined, importances, sums, tables])
         inputs = [settings, samples, discoveries, origins, state.tables.exploration, tables.exploration]
         lesson.launch(light_cache_build.adapt_exploration, inputs)
-        return CacheState(tables, joined, state.centers, state.shapes)
+        return replace(state, tables=tables, known=joined)
 
 
 @dataclass
@@ -162,6 +194,10 @@ class CacheState:
     """float64 [emitter, 3] metres, in the last frame."""
     shapes: wp.array | None = field(default=None, metadata={"derived": True})
     """LightShape [emitter]; None before the first frame."""
+    emitters: wp.array | None = field(default=None, metadata={"derived": True})
+    """Emitter [emitter] of the scene; None before the first frame."""
+    tree: TreeState | None = field(default=None, metadata={"derived": True})
+    """For exploration; None before the first frame."""
 
 
 def _tables(leaves: int, device: wp.Device, exploration: float) -> light_cache.CacheTables:
@@ -169,6 +205,7 @@ def _tables(leaves: int, device: wp.Device, exploration: float) -> light_cache.C
     tables.buckets = wp.zeros(leaves, dtype=wp.int32, device=device)
     tables.offsets = wp.zeros(leaves, dtype=wp.int32, device=device)
     tables.items = wp.zeros(0, dtype=wp.int32, device=device)
+    tables.chances = wp.zeros(0, dtype=wp.float32, device=device)
     tables.exploration = wp.full(leaves, exploration, dtype=wp.float32, device=device)
     return tables
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 BUILTIN_SCENES = {
     "atrium": "two storeys of arcades around a sunlit court, about 170K triangles",
     "cornell_box": "the classic test of colour bleeding, in a box of 2 m",
+    "mine": "a cavern and tunnels of rock, lit by a sun-lit spot below a shaft, about 80K triangles",
     "sphere_row": "metal spheres of rising roughness on a plane",
     "street": "houses with balconies and trees with many leaves, about 130K triangles",
     "two_rooms": "one lit and one dark room with a thin wall between them",

@@ -1,0 +1,184 @@
+"""What the suite `reuse` looks at: places, pictures without noise, and sequences of frames by several pipelines."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+import warp_gi as gi
+from warp_gi import launch
+from warp_gi.bench import presets
+from warp_gi.bench.stages import Place, Times, cost
+
+MEASURED = ("emitters", "indirect", "beauty")
+SEED = 11
+TOLERANCE = 1.2
+"""Times the settled error: within it, a sequence has settled."""
+_NOT_OF_A_FRAME = ("bake", "compile", "scene")
+
+
+# ---- places ----
+
+
+def _builtin(name: str, camera: str, **settings: object) -> Place:
+    label = name if camera == "main" else f"{name}, {camera}"
+    label += ", one bounce" if settings else ""
+    return Place(
+        label, lambda: gi.builtin_scene(name), lambda: gi.builtin_scene(name).cameras[camera], settings=dict(settings)
+    )
+
+
+def _loaded(name: str, file: str, camera: gi.Camera) -> Place:
+    return Place(name, lambda: gi.load_scene(presets.SCENES / file), lambda: camera, file=file)
+
+
+WAREHOUSE = _builtin("warehouse", "main")
+MINE = _builtin("mine", "spot")
+MINE_ONE_BOUNCE = _builtin("mine", "spot", max_depth=3)
+"""All indirect light comes straight from the sun-lit spot, or from what the sky lights around it."""
+DRAGON = Place(
+    "dragon",
+    presets.covered_dragon,
+    lambda: gi.Camera.look_at((0.6, 1.3, 2.7), (0.0, 0.7, 0.0), hfov=60.0),
+    file="stanford_dragon.ply",
+)
+BISTRO = _loaded("Bistro", "bistro_exterior.glb", gi.Camera.look_at((-40, 45, -60), (-10, 0, -10), hfov=60.0))
+HALL = _loaded("modern hall", "modern_hall.glb", gi.Camera.look_at((4, 1.7, 2), (-3, 1.6, -0.5), hfov=60.0))
+CORNELL = _builtin("cornell_box", "main")
+SPHERES = _builtin("sphere_row", "main")
+RING = Place("guiding_ring", presets.guiding_ring, lambda: gi.Camera.look_at((0, 6, 0.01), (0, 0, 0), hfov=26.0))
+STROBE = Place("strobe", presets.strobe, lambda: gi.Camera.look_at((-1.5, 1.6, 2.8), (0.3, 0.9, -1.0), hfov=75.0))
+
+
+# ---- truth ----
+
+
+@dataclass
+class Truth:
+    """The path tracer's pictures of a frame, twice, independent of each other and of all that is measured.
+
+    Errors against one half times errors against the other: the noise of independent halves has mean 0.
+    """
+
+    scene: gi.Scene
+    camera: gi.Camera
+    device: str = "cpu"
+    spp: int = 64
+    frame: int = 0
+    settings: Mapping[str, int] = field(default_factory=dict)
+    """Of the paths."""
+    _halves: list[dict[str, np.ndarray]] = field(default_factory=list)
+
+    @property
+    def halves(self) -> list[dict[str, np.ndarray]]:
+        """Pictures by term."""
+        if not self._halves:
+            pipeline = gi.Pipeline(indirect=gi.BsdfPaths(**self.settings), spp=self.spp, camera_samples=1)
+            for half in range(2):
+                scheduler = gi.FrameScheduler(self.scene, self.camera, pipeline, self.device, seed=SEED + 1000 + half)
+                frame = scheduler.frame(self.frame)
+                self._halves.append({term: frame.numpy(term).astype(np.float64) for term in MEASURED})
+        return self._halves
+
+    def errors(self, frame: gi.Frame) -> dict[str, float]:
+        """Return the mean squared error of each term."""
+        a, b = self.halves
+        pictures = {term: frame.numpy(term) for term in MEASURED}
+        return {term: float(np.mean((p - a[term]) * (p - b[term]))) for term, p in pictures.items()}
+
+
+# ---- sequences ----
+
+
+@dataclass
+class FrameRun:
+    """Frames of one pipeline: errors, times, and the last one."""
+
+    scheduler: gi.FrameScheduler
+    errors: dict[str, list[float]] = field(default_factory=lambda: {term: [] for term in MEASURED})
+    timings: list[dict[str, float]] = field(default_factory=list)
+    times: list[Times] = field(default_factory=list)
+    """Of whole frames."""
+    frame: gi.Frame | None = None
+
+    def step(self, index: int, truth: Truth) -> None:
+        """Render a frame and measure it."""
+        compiled, wall, cpu = launch.compile_seconds, time.perf_counter(), time.process_time()
+        self.frame = self.scheduler.frame(index)
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        compiled = launch.compile_seconds - compiled
+        self.times.append((wall - compiled, max(cpu - compiled, 0.0)))
+        self.timings.append(dict(self.frame.timings))
+        for term, error in truth.errors(self.frame).items():
+            self.errors[term].append(error)
+
+    def error(self, term: str, first: int) -> float:
+        """Return the mean error of the frames from ``first`` on."""
+        return max(float(np.mean(self.errors[term][first:])), 0.0)
+
+    def milliseconds(self, prefix: str, first: int) -> float:
+        """Return the median wall time of the stages whose names begin so; of all of them for ""."""
+        return sum(ms for name, ms in self.stage_milliseconds(first).items() if name.startswith(prefix))
+
+    def stage_milliseconds(self, first: int) -> dict[str, float]:
+        """Return the median wall time by stage."""
+        kept = self.timings[first:]
+        names = [name for name in kept[-1] if name not in _NOT_OF_A_FRAME]
+        return {name: 1e3 * float(np.median([timings.get(name, 0.0) for timings in kept])) for name in names}
+
+    def cost(self, first: int, device: str) -> float:
+        """Return the median of what counts of a frame's time, seconds."""
+        return cost(tuple(np.median(self.times[first:], axis=0)), device)
+
+
+def run_sequences(
+    scene: gi.Scene,
+    camera: gi.Camera,
+    pipelines: Mapping[str, gi.Pipeline],
+    frames: int,
+    truth: Callable[[int], Truth],
+    device: str,
+    seed: int = SEED,
+) -> dict[str, FrameRun]:
+    """Return the first ``frames`` frames by each pipeline, which take turns; ``truth`` is what a frame should be."""
+    runs = {
+        name: FrameRun(gi.FrameScheduler(scene, camera, pipeline, device, seed=seed))
+        for name, pipeline in pipelines.items()
+    }
+    for index in range(frames):
+        for run in runs.values():
+            run.step(index, truth(index))
+    return runs
+
+
+def mean_series(series: Sequence[Sequence[float]]) -> np.ndarray:
+    """Return the mean of error series over seeds, [frame]."""
+    return np.maximum(np.mean(np.asarray(series, np.float64), axis=0), 0.0)
+
+
+def settled_at(series: Sequence[float], settled: Sequence[float], window: int = 3) -> int:
+    """Return the first frame from which on errors stay within `TOLERANCE` of the mean of ``settled``, errors too.
+
+    A frame's error is noisy: it counts as the mean with the frames after it, ``window`` in all, less the standard
+    deviation that such a mean of settled errors has. The length of the series says that it never settles.
+    """
+    series, settled = np.asarray(series, np.float64), np.asarray(settled, np.float64)
+    bound = TOLERANCE * settled.mean() + settled.std() / window**0.5
+    means = np.lib.stride_tricks.sliding_window_view(series, window).mean(axis=1)
+    above = np.flatnonzero(means > bound)
+    if not len(above):
+        return 0
+    return len(series) if above[-1] == len(means) - 1 else int(above[-1]) + 1
+
+
+def written(series: Sequence[float], unit: float = 1.0) -> str:
+    """Return numbers as short text, in units of ``unit``."""
+    return " ".join(f"{value / max(unit, 1e-30):.2f}" for value in series)
+
+
+def ratio(a: float, b: float) -> float:
+    """Return a / b, and 1 where there is nothing in both."""
+    return 1.0 if max(a, b) <= 1e-12 else a / max(b, 1e-30)

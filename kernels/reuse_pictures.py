@@ -1,0 +1,122 @@
+"""What pictures of sample reuse show: the octree leaf that a pixel sees, the light that comes there, a quadtree.
+
+The light is path traced and counts as guided directions learn it: what an emitter sends straight to the point is left
+out, for that is sampled by light samplers.
+"""
+
+import warp as wp
+
+from warp_gi.kernels.bsdf import luminance
+from warp_gi.kernels.bvh import bvh_intersect
+from warp_gi.kernels.environment import environment_radiance
+from warp_gi.kernels.gbuffer import CameraData, camera_ray
+from warp_gi.kernels.octahedral import octahedral_decode
+from warp_gi.kernels.octree import Octree, cell_code, octree_leaf
+from warp_gi.kernels.path_trace import (
+    TERM_EMITTERS,
+    TERM_ENVIRONMENT,
+    TERM_INDIRECT,
+    PathSamplers,
+    PathSettings,
+    trace_path,
+)
+from warp_gi.kernels.quadtree import quadtree_locate, quadtree_pdf
+from warp_gi.kernels.sampling import morton_code, sample_2d
+from warp_gi.kernels.surface import ray_origin, surface_at
+from warp_gi.kernels.types import SceneData
+
+wp.set_module_options({"enable_backward": False})
+
+JITTER_DIMENSION = wp.constant(0)  # paths begin with 1
+
+
+# What rays through the middles of pixels meet, [item].
+@wp.struct
+class LeafView:
+    leaves: wp.array(dtype=wp.int32)  # of the octree; -1: no surface
+    origins: wp.array(dtype=wp.vec3)  # where rays leave the surface
+    normals: wp.array(dtype=wp.vec3)  # geometric, unit, towards the camera
+
+
+# An octahedral map of what comes to a point.
+@wp.struct
+class IncidentMap:
+    origin: wp.vec3
+    normal: wp.vec3  # directions below the surface get 0
+    resolution: wp.int32
+    rays: wp.int32  # of a texel, anywhere in it
+    seed: wp.uint32
+    max_depth: wp.int32  # edges of the longest path that is seen, that to the point included; below 2: none
+    sky_probability: wp.float32  # PathSettings
+    sees_sky: wp.int32  # 1: count the sky's light that comes straight
+    light: wp.array(dtype=wp.float32)  # [resolution^2] luminance of the mean radiance
+
+
+# Thread: a pixel, the first of which is number `begin`, row by row.
+@wp.kernel
+def view_leaves(first: wp.int32, scene: SceneData, camera: CameraData, begin: wp.int32, octree: Octree, view: LeafView):
+    item = first + wp.tid()
+    row = (begin + item) / camera.width
+    column = begin + item - row * camera.width
+    direction = camera_ray(camera, wp.float32(column) + 0.5, wp.float32(row) + 0.5)
+    hit = bvh_intersect(scene.bvh, camera.position, direction, float(wp.inf))
+    view.leaves[item] = -1
+    if hit.face >= 0:
+        s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
+        view.leaves[item] = octree_leaf(octree.nodes, cell_code(octree, s.position))
+        view.origins[item] = ray_origin(s)
+        view.normals[item] = s.normal
+
+
+# Luminance that comes to the point from a direction.
+@wp.func
+def incident_luminance(scene: SceneData, incident: IncidentMap, direction: wp.vec3, index: wp.uint32) -> wp.float32:
+    if wp.dot(direction, incident.normal) <= 0.0:
+        return 0.0
+    hit = bvh_intersect(scene.bvh, incident.origin, direction, float(wp.inf))
+    if hit.face < 0:
+        if incident.sees_sky == 0:
+            return 0.0
+        return luminance(environment_radiance(scene.environment, direction))
+    paths = PathSettings()
+    paths.terms = TERM_ENVIRONMENT | TERM_EMITTERS | TERM_INDIRECT
+    paths.max_depth = incident.max_depth
+    paths.roulette_depth = incident.max_depth
+    paths.sky_probability = incident.sky_probability
+    s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
+    path = trace_path(scene, PathSamplers(), hit, s, -direction, paths, index, incident.seed, -1)
+    return luminance(path.environment + path.emitters + path.indirect)
+
+
+# Thread: a texel.
+@wp.kernel
+def map_incident_light(first: wp.int32, scene: SceneData, incident: IncidentMap):
+    texel = first + wp.tid()
+    row = texel / incident.resolution
+    column = texel - row * incident.resolution
+    begin = morton_code(column, row) * wp.uint32(incident.rays)
+    total = float(0.0)
+    for ray in range(incident.rays):
+        index = begin + wp.uint32(ray)
+        u = sample_2d(index, incident.seed, JITTER_DIMENSION)
+        uv = wp.vec2(wp.float32(column) + u[0], wp.float32(row) + u[1]) / wp.float32(incident.resolution)
+        total += incident_luminance(scene, incident, octahedral_decode(uv), index)
+    incident.light[texel] = total / wp.float32(incident.rays)
+
+
+# Thread: a pixel of an octahedral incident. The density [1/sr] of the direction in its middle, and the quadtree's leaf.
+@wp.kernel
+def map_quadtree(
+    first: wp.int32,
+    tree: wp.vec4ui,
+    bits: wp.int32,
+    resolution: wp.int32,
+    densities: wp.array(dtype=wp.float32),
+    leaves: wp.array(dtype=wp.int32),
+):
+    pixel = first + wp.tid()
+    row = pixel / resolution
+    column = pixel - row * resolution
+    uv = wp.vec2(wp.float32(column) + 0.5, wp.float32(row) + 0.5) / wp.float32(resolution)
+    densities[pixel] = quadtree_pdf(tree, bits, octahedral_decode(uv))
+    leaves[pixel] = quadtree_locate(tree, bits, uv).node
