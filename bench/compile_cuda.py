@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import multiprocessing
 import pkgutil
 import tempfile
 import time
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from types import ModuleType
 
 import warp as wp
 
 import warp_gi.kernels
+from warp_gi import launch
 from warp_gi.kernels.path_tracers import every_tracer
 
 ARCHITECTURES = (80, 90)
@@ -38,18 +41,26 @@ def compile_module(name: str, architectures: Sequence[int], folder: Path) -> lis
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Compile all and print what it took."""
+    """Compile all, on every core, and print what it took."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("arch", nargs="*", type=int, default=ARCHITECTURES, help="compute capability, as 90")
     options = parser.parse_args(arguments)
-    wp.config.quiet = True
-    for name in kernel_modules():
-        started = time.perf_counter()
-        with tempfile.TemporaryDirectory() as folder:
-            paths = compile_module(name, options.arch, Path(folder))
-            size = sum(path.stat().st_size for path in paths)
-        print(f"{name}: {len(paths)} files, {size / 1e3:.0f} kB, {time.perf_counter() - started:.1f} s", flush=True)
+    names = kernel_modules()
+    with ProcessPoolExecutor(launch.thread_count(), multiprocessing.get_context("spawn")) as pool:
+        for line in pool.map(_compiled, names, [options.arch] * len(names)):
+            print(line, flush=True)
     return 0
+
+
+def _compiled(name: str, architectures: Sequence[int]) -> str:
+    """Compile a module in a process of its own, and return what to print."""
+    wp.config.quiet = True
+    kernel_modules()  # a Warp module is known once its file is imported
+    started = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        paths = compile_module(name, architectures, Path(folder))
+        size = sum(path.stat().st_size for path in paths)
+    return f"{name}: {len(paths)} files, {size / 1e3:.0f} kB, {time.perf_counter() - started:.1f} s"
 
 
 def _has_kernels(module: ModuleType) -> bool:

@@ -113,25 +113,56 @@ def _wait_for(folder, count):
         time.sleep(0.002)
 
 
-def test_killed_runs_resume_to_the_same_files(unbroken, tmp_path):
+LEARNT = ["--pipeline=reuse", "--octree.split=1500", "--octree.collapse=700", "--spp=16", "--octree.most-samples=50000"]
+
+
+@pytest.mark.parametrize("extra", [[], LEARNT], ids=["path", "learnt"])
+def test_killed_runs_resume_to_the_same_files(unbroken, tmp_path, extra):
+    """And where light is learnt from frame to frame, the state between them is kept as well."""
     broken, whole = tmp_path / "broken", tmp_path / "whole"
     for count in (1, 3, 4):
-        process = _start(broken, "--resume", "--preview")
+        process = _start(broken, "--resume", "--preview", *extra)
         _wait_for(broken, count)
         process.kill()
         assert process.wait() == -signal.SIGKILL
         for path in broken.glob("a.*.exr"):
             assert sequence.is_whole(path), path
     for folder in (broken, whole):
-        process = _start(folder, "--resume", "--preview")
+        process = _start(folder, "--resume", "--preview", *extra)
         assert process.communicate(timeout=200) == ("", "") and process.returncode == 0
     names = sorted(path.name for path in whole.iterdir())
-    assert len(names) == 16
+    assert len(names) == 16 + bool(extra)
     leftovers = [path for path in broken.iterdir() if path.name not in names]
     assert leftovers == []
     for name in names:
         a, b = broken / name, whole / name
         assert same_frame(a, b) if name.endswith(".exr") else a.read_bytes() == b.read_bytes(), name
+
+
+def test_learnt_frames_go_on_from_the_saved_state(tmp_path, capsys):
+    """Frames after those that are there need no others again; a hole among them, or a damaged state, does."""
+    command = [
+        "render",
+        "cornell_box",
+        "--resolution=24x16",
+        "--spp=4",
+        "--pipeline=reuse",
+        "-o",
+        f"{tmp_path}/a.####.exr",
+    ]
+    assert cli.main([*command, "--frames=0-1", "--quiet"]) == 0
+    assert cli.main([*command, "--frames=0-3", "--resume"]) == 0
+    printed = capsys.readouterr().out
+    assert "2 of 4 frames are there already" in printed and "again" not in printed
+    (tmp_path / "a.0002.exr").unlink()
+    assert cli.main([*command, "--frames=0-3", "--resume"]) == 0
+    assert "every frame is rendered again: no saved state fits" in capsys.readouterr().out
+    state = tmp_path / "a.state.safetensors"
+    state.write_bytes(state.read_bytes()[:-5])
+    assert cli.main([*command, "--frames=0-4", "--resume"]) == 0
+    assert "every frame is rendered again: no saved state fits" in capsys.readouterr().out
+    assert cli.main([*command, "--frames=0-4", "--resume"]) == 0
+    assert "5 of 5 frames are there already" in capsys.readouterr().out
 
 
 def test_ctrl_c_keeps_what_is_done(unbroken, tmp_path):

@@ -15,16 +15,32 @@ from statistics_tools import chi_squared, device, every_device  # noqa: F401
 import warp_gi as gi
 from warp_gi.alias import AliasTable
 from warp_gi.bench.presets import light, quad
-from warp_gi.kernels import bsdf, light_cache, light_cache_build, ltc, samples, surface, types
+from warp_gi.kernels import (
+    bsdf,
+    light_cache,
+    light_cache_build,
+    light_cache_native,
+    light_hierarchy,
+    ltc,
+    octree,
+    samples,
+    surface,
+    types,
+)
 from warp_gi.kernels.emitters import punctual_light
 from warp_gi.launch import copied, launch, set_threads
-from warp_gi.techniques.visibility_light_cache import CacheState
+from warp_gi.techniques.light_tree import EmitterBounds, build_tree, to_device
+from warp_gi.techniques.ltc import ltc_table
+from warp_gi.techniques.visibility_light_cache import EXPLORES_BY, CacheState
 
 wp.set_module_options({"enable_backward": False})
 
 VISIBLE, NEW, GLOSSY = 1 << 31, 1 << 30, 1 << 29
 MOST_LISTED = 1024
-MOST_BUCKETS = 64
+MOST_BUCKETS = 64  # beside the first
+LEAST_CHANCE = 0.05
+MAIN, LEFT_OUT = -1.0, -1.0
+ROUNDING = 2e-3, 1.5e-5  # of a weight: relative, and times the light's luminance
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
@@ -77,6 +93,22 @@ def choose_lights(
     is_new[i, k] = choice.is_new
 
 
+# The hierarchy's probability of each light.
+@wp.kernel
+def ask_hierarchy(
+    first: wp.int32,
+    tree: light_hierarchy.LightTree,
+    scene: types.SceneData,
+    spots: Spots,
+    pdfs: wp.array2d(dtype=wp.float32),
+):
+    item = first + wp.tid()
+    i = item / scene.emitters.count
+    emitter = item - i * scene.emitters.count
+    s = surface.surface_at(scene, spots.faces[i], 0.3, 0.3, spots.views[i])
+    pdfs[i, emitter] = light_hierarchy.hierarchy_pdf(tree, surface.ray_origin(s), surface.shading_normal(s), emitter)
+
+
 # Luminance that a surface reflects of a light, from the scene's triangles one at a time.
 @wp.kernel
 def weigh_lights(
@@ -110,19 +142,104 @@ def weigh_lights(
         weights[i, emitter] = bsdf.luminance(wp.cw_mul(f.value, sample.radiance))
 
 
+# What a light may bring to each of the places (centre, radius).
+@wp.kernel
+def ask_importances(
+    first: wp.int32,
+    cache: light_cache.LightCache,
+    places: wp.array(dtype=wp.vec4),
+    importances: wp.array2d(dtype=wp.float32),
+):
+    item = first + wp.tid()
+    i = item / importances.shape[1]
+    emitter = item - i * importances.shape[1]
+    place = places[i]
+    center = wp.vec3(place[0], place[1], place[2])
+    importances[i, emitter] = light_cache_build.region_importance(cache, emitter, center, place[3])
+
+
+@wp.kernel
+def ask_cells(first: wp.int32, cube: octree.Octree, tree: octree.OctreeNodes, cells: wp.array(dtype=wp.vec4)):
+    leaf = first + wp.tid()
+    cells[leaf] = octree.leaf_cell(cube, tree, leaf)
+
+
+# Points that see buckets of triangles; a material is metallic, roughness and specular (below 0: plain Lambert).
+@wp.struct
+class LanePoints:
+    origins: wp.array(dtype=wp.vec3)
+    shadings: wp.array(dtype=wp.mat33)
+    views: wp.array(dtype=wp.vec3)  # in the shading frame
+    materials: wp.array(dtype=wp.vec3)
+    counts: wp.array(dtype=wp.int32)  # lights of the bucket, which begins at 32 * point + 5
+    items: wp.array(dtype=wp.int32)
+    shapes: wp.array(dtype=light_cache_native.LightShape)
+
+
+@wp.func
+def lobes_at(points: LanePoints, table: ltc.LtcTable, i: wp.int32) -> ltc.LobeWeights:
+    color = wp.vec3(0.8, 0.5, 0.2)
+    m = points.materials[i]
+    b = bsdf.lambert(color)
+    if m[2] >= 0.0:
+        b = bsdf.make_bsdf(color, m[0], m[1], m[2])
+    return ltc.lobe_weights(table, b, points.views[i])
+
+
+# Thread: a point.
+@wp.kernel
+def weigh_in_lanes(first: wp.int32, points: LanePoints, table: ltc.LtcTable, weights: wp.array2d(dtype=wp.float32)):
+    i = first + wp.tid()
+    w = lobes_at(points, table, i)
+    found = light_cache_native.weigh_triangles(
+        points.shapes, points.items, 32 * i + 5, points.counts[i], points.origins[i], points.shadings[i], w
+    )
+    for k in range(points.counts[i]):
+        weights[i, k] = found[k]
+
+
+# Thread: a point and a light of its bucket. `heights` are the lowest and the highest corner above the surface's
+# horizon and above the lobe's, as sines; `backs`: positive where the point sees the light's back.
+@wp.kernel
+def weigh_one_by_one(
+    first: wp.int32,
+    points: LanePoints,
+    table: ltc.LtcTable,
+    weights: wp.array2d(dtype=wp.float32),
+    heights: wp.array2d(dtype=wp.vec4),
+    backs: wp.array2d(dtype=wp.float32),
+):
+    item = first + wp.tid()
+    i = item / 32
+    k = item - 32 * i
+    shape = points.shapes[points.items[item + 5]]
+    w = lobes_at(points, table, i)
+    m = wp.transpose(points.shadings[i])
+    a = m * (shape.p0 - points.origins[i])
+    b = m * (shape.p1 - points.origins[i])
+    c = m * (shape.p2 - points.origins[i])
+    weights[i, k] = shape.luminance * ltc.triangle_weight(w, a, b, c)
+    backs[i, k] = wp.dot(wp.normalize(wp.cross(b - a, c - a)), wp.normalize(a))
+    z = wp.vec3(wp.normalize(a)[2], wp.normalize(b)[2], wp.normalize(c)[2])
+    p = wp.normalize(w.matrix * a)
+    q = wp.normalize(w.matrix * b)
+    r = wp.normalize(w.matrix * c)
+    heights[i, k] = wp.vec4(wp.min(z), wp.max(z), wp.min(wp.vec3(p[2], q[2], r[2])), wp.max(wp.vec3(p[2], q[2], r[2])))
+
+
 def array(values, dtype=wp.int32):
     return wp.array(np.asarray(values), dtype=dtype, device=device())
 
 
 # ---- a scene of lights of all kinds ----
 
-FLOOR, GLOSSY_FLOOR, METAL_FLOOR = 0, 2, 4  # first triangle of each
+FLOOR, GLOSSY_FLOOR, METAL_FLOOR, ROOF = 0, 2, 4, 6  # first triangle of each
 VIEWS = {"above": (0.3, 0.8, 0.2), "slant": (0.95, 0.1, 0.2), "below": (0.1, -0.9, 0.3)}
 
 
 @cache
 def lit_scene():
-    """Three floors below 200 triangles and three lights without size; lamps of five sorts by turns."""
+    """Three floors and a roof, 200 triangles and three lights without size between; lamps of five sorts by turns."""
     rng = np.random.default_rng(1)
     materials = [
         gi.Material("lambert", (0.5, 0.4, 0.3), specular=0.0),
@@ -130,6 +247,7 @@ def lit_scene():
         gi.Material("metal", (0.9, 0.8, 0.5), metallic=1.0, roughness=0.15),
     ]
     floors = [quad((-3, 0, 2 * i), (0, 0, 2), (2, 0, 0), material) for i, material in enumerate(materials)]
+    floors.append(quad((-3, 20, 0), (0, 0, 2), (2, 0, 0), materials[0]))
     lamps = []
     for i in range(100):
         corner = np.array([rng.uniform(-4, 4), rng.uniform(1, 4), rng.uniform(-2, 6)])
@@ -172,57 +290,118 @@ def preprocessed(scene, estimator=None, state=None, time=0.0, position=(0.0, 1.0
 
 
 def table(contents):
-    """CacheTables of regions, each (emitters, buckets, exploration), and what they really hold, region by region."""
-    buckets, offsets, items, held = [], [], [], []
-    for emitters, count, _ in contents:
-        lists = [sorted(e for e in emitters if e % count == k)[:32] for k in range(count)]
-        buckets.append(count | sum(not x for x in lists) << 16)
+    """CacheTables of regions: lights of the first bucket, other lights, buckets of these (0: none), exploration."""
+    rng = np.random.default_rng(4)
+    buckets, offsets, items, chances = [], [], [], []
+    for main, others, count, _ in contents:
+        held = [sorted(main)] * (len(main) > 0) + [sorted(e for e in others if e % count == k) for k in range(count)]
+        parts = np.array([rng.uniform(0.05, 1) if x else 0.0 for x in held])
+        sums = np.cumsum(parts) / max(parts.sum(), 1e-30)
+        sums[np.cumsum(parts) >= parts.sum()] = 1.0
+        buckets.append(len(held))
         offsets.append(len(items))
-        items += [*np.cumsum([len(x) for x in lists]), *(e for x in lists for e in x)]
-        held.append({int(e) for x in lists for e in x})
+        items += [*np.cumsum([len(x) for x in held]), *(e for x in held for e in x)]
+        chances += [*sums, *[np.nan] * sum(map(len, held))]
+        assert all(len(x) <= 32 for x in held)
     tables = light_cache.CacheTables()
     tables.buckets, tables.offsets = array(buckets), array(offsets)
-    tables.items = array(np.array(items, np.int32))
+    tables.items, tables.chances = array(np.array(items, np.int32)), array(chances, wp.float32)
     tables.exploration = array([share for *_, share in contents], wp.float32)
-    return tables, held
+    return tables
 
 
 CONTENTS = {
-    "empty": ([], 0, 0.1),
-    "one light": ([40], 1, 0.1),
-    "one light of eight buckets": ([43], 8, 0.05),
-    "a full bucket": (range(32), 1, 0.1),
-    "two full buckets": (range(64), 2, 0.02),
-    "all": (range(203), 8, 0.02),
-    "holes": ([*range(0, 200, 8), *range(3, 200, 8)], 8, 0.3),
-    "many buckets": (range(90, 203), 64, 0.1),
-    "underground": ([8, 9, 18, 19, 28], 2, 0.1),
-    "turned away": ([2, 3, 12, 13, 22, 23], 1, 0.1),
-    "without size": ([200, 201, 202], 1, 0.1),
-    "without size, spread": ([200, 201, 202], 4, 0.1),
-    "explores only": (range(20), 1, 1.0),
+    "empty": ([], [], 0, 0.1),
+    "one light": ([40], [], 0, 0.1),
+    "one light beside": ([40], [43], 8, 0.05),
+    "a full bucket": (range(32), [], 0, 0.1),
+    "two full buckets": (range(5, 37), [*range(5), *range(37, 64)], 1, 0.02),
+    "all": (range(0, 203, 7), [e for e in range(203) if e % 7], 8, 0.02),
+    "holes": ([5, 6], [*range(0, 200, 8), *range(3, 200, 8)], 8, 0.3),
+    "many buckets": (range(90, 100), range(100, 203), 64, 0.1),
+    "underground": ([8, 9], [18, 19, 28], 2, 0.1),
+    "turned away": ([2, 3, 12, 13, 22, 23], [], 0, 0.1),
+    "without size": ([200, 201, 202], [], 0, 0.1),
+    "without size, spread": ([200], [201, 202], 4, 0.1),
+    "explores only": (range(20), [], 0, 1.0),
 }
 PLACES = [(face, view) for face in (FLOOR, GLOSSY_FLOOR, METAL_FLOOR) for view in VIEWS]
+PLACES.append((ROOF, "above"))  # whence the sun is all there is
 
 
-def lit_cache():
-    frame, _ = preprocessed(lit_scene())
+def lit_cache(explores_by="hierarchy"):
+    """A frame, the LightCache of CONTENTS, and PLACES in each of its regions."""
+    frame, _ = preprocessed(lit_scene(), gi.VisibilityLightCache(explores_by=explores_by))
     data = frame.lights.data
-    data.tables, held = table(CONTENTS.values())
+    data.tables = table(CONTENTS.values())
+    return frame, data, spots_in(np.arange(len(CONTENTS)))
+
+
+def spots_in(regions):
+    """All PLACES in each of the regions, one after another."""
     spots = Spots()
-    spots.faces = array([face for _ in CONTENTS for face, _ in PLACES])
+    spots.faces = array([face for _ in regions for face, _ in PLACES])
     directions = np.array([VIEWS[view] for _, view in PLACES])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    spots.views = array(np.tile(directions, (len(CONTENTS), 1)), wp.vec3)
-    spots.regions = array(np.repeat(np.arange(len(CONTENTS)), len(PLACES)))
-    return frame, data, held, spots
+    spots.views = array(np.tile(directions, (len(regions), 1)), wp.vec3)
+    spots.regions = array(np.repeat(regions, len(PLACES)))
+    return spots
+
+
+def asked(kernel, data, frame, spots):
+    """Return float64 [spot, emitter] of one of the kernels."""
+    out = wp.empty((spots.faces.shape[0], frame.data.emitters.count), dtype=wp.float32, device=device())
+    launch(kernel, out.size, [data, frame.data, spots, out], device())
+    return out.numpy().astype(np.float64)
 
 
 def probabilities(frame, data, spots):
-    count = frame.data.emitters.count
-    pdfs = wp.empty((spots.faces.shape[0], count), dtype=wp.float32, device=device())
-    launch(ask_probabilities, pdfs.size, [data, frame.data, spots, pdfs], device())
-    return pdfs.numpy().astype(np.float64)
+    return asked(ask_probabilities, data, frame, spots)
+
+
+def explored(frame, data, spots):
+    """Probabilities of lights where a sample explores."""
+    if data.explores_by_tree:
+        return asked(ask_hierarchy, data.tree, frame, spots)
+    return np.tile(explored_by_table(frame), (spots.faces.shape[0], 1))
+
+
+def explored_by_table(frame):
+    return frame.data.emitters.alias.numpy()["pdf"].astype(float)
+
+
+def contents_of(tables):
+    """Of each region the emitters of its buckets, and the chance of each bucket."""
+    out = []
+    items, chances = tables.items.numpy(), tables.chances.numpy().astype(np.float64)
+    for count, offset in zip(tables.buckets.numpy(), tables.offsets.numpy(), strict=True):
+        ends = items[offset : offset + count]
+        begins = np.concatenate([[0], ends[:-1]]) if count else []
+        held = [items[offset + count + b : offset + count + e].tolist() for b, e in zip(begins, ends, strict=True)]
+        out.append((held, np.diff(chances[offset : offset + count], prepend=0.0)))
+    return out
+
+
+def expected_probabilities(frame, data, spots):
+    """By Algorithm 1, with weights one at a time; and how much a probability may be off by the rounding of these."""
+    weights, explores = asked(weigh_lights, data, frame, spots), explored(frame, data, spots)
+    contents, shares = contents_of(data.tables), data.tables.exploration.numpy().astype(np.float64)
+    luminances = data.shapes.numpy()["luminance"]
+    expected, slack = np.zeros_like(weights), np.zeros_like(weights)
+    for row, region in enumerate(spots.regions.numpy()):
+        held, chances = contents[region]
+        share = shares[region] if held else 1.0
+        lambert = PLACES[row % len(PLACES)][0] in (FLOOR, ROOF)
+        for lights, chance in zip(held, chances, strict=True):
+            unit, weight = (1 - share) * chance, weights[row, lights]
+            total = weight.sum()
+            expected[row, lights] = unit * (weight / total if total > 0 else 1 / max(len(lights), 1))
+            if total > 0:
+                error = ROUNDING[0] * weight + (0.0 if lambert else ROUNDING[1]) * luminances[lights]
+                least = max(total - error.sum(), 1e-30)
+                slack[row, lights] = unit * np.minimum(error / least + weight / total * error.sum() / least, 1.0)
+        expected[row] += share * explores[row]
+    return expected, slack, weights
 
 
 def choices(frame, data, spots, numbers):
@@ -236,92 +415,131 @@ def choices(frame, data, spots, numbers):
 # ---- probabilities ----
 
 
-def test_probabilities_sum_to_one():
-    frame, data, _, spots = lit_cache()
-    pdfs = probabilities(frame, data, spots)
+def learnt_cache(explores_by):
+    """A frame, the LightCache after two frames of learning, and PLACES in regions with the most buckets and the least.
+
+    Regions have eight lights a bucket; most know more.
+    """
+    estimator = gi.VisibilityLightCache(explores_by=explores_by, capacity=8)
+    _, state = preprocessed(lit_scene(), estimator)
+    for seed in (5, 6):
+        state = estimator.learn(deep_lesson(seed)[1], state)
+    frame, state = preprocessed(lit_scene(), estimator, state)
+    buckets = state.tables.buckets.numpy()
+    assert buckets.max() >= 5
+    leaves = np.concatenate([np.argsort(-buckets)[:6], [np.flatnonzero(buckets == n)[0] for n in (0, 1, 2)]])
+    return frame, frame.lights.data, spots_in(leaves)
+
+
+CACHES = {"made": lit_cache, "learnt": learnt_cache}
+both_ways = pytest.mark.parametrize("explores_by", EXPLORES_BY)
+both_caches = pytest.mark.parametrize("kind", CACHES)
+
+
+@both_ways
+@both_caches
+def test_probabilities_sum_to_one(kind, explores_by):
+    """Or to what the hierarchy's do: it offers nothing where all lights that have a place are below the horizon."""
+    frame, data, spots = CACHES[kind](explores_by)
+    pdfs, explores = probabilities(frame, data, spots), explored(frame, data, spots)
     assert frame.data.emitters.count == 203
-    assert (pdfs > 0).all(), "a light that nothing selects"
-    assert np.allclose(pdfs.sum(axis=1), 1.0, atol=2e-5)
-
-
-def test_probabilities_are_those_of_the_weights():
-    """However many lights are weighed at once, by whatever means; of every sort of light, on every sort of surface."""
-    frame, data, held, spots = lit_cache()
-    pdfs = probabilities(frame, data, spots)
-    out = wp.empty(pdfs.shape, dtype=wp.float32, device=device())
-    launch(weigh_lights, out.size, [data, frame.data, spots, out], device())
-    alias = frame.data.emitters.alias.numpy()["pdf"].astype(float)
     regions = spots.regions.numpy()
-    assert (out.numpy() >= 0).all() and (out.numpy() > 0).mean() > 0.2
-    for row, weights in enumerate(out.numpy().astype(float)):
-        _, buckets, share = list(CONTENTS.values())[regions[row]]
-        expected, left = np.zeros(len(alias)), 1.0
-        for k in range(buckets):
-            lights = [e for e in held[regions[row]] if e % buckets == k]
-            if lights:
-                total = weights[lights].sum()
-                expected[lights] = weights[lights] / total if total > 0 else 1 / len(lights)
-                expected[lights] *= (1 - share) / buckets
-                left -= (1 - share) / buckets
-        face = PLACES[row % len(PLACES)][0]
-        if face == METAL_FLOOR:
-            continue  # narrow lobes: lights in their tails get what rounding leaves
-        slack = (0.002 if face == GLOSSY_FLOOR else 0.0) * (1 - share) / max(buckets, 1)
-        assert np.allclose(pdfs[row], expected + left * alias, rtol=2e-3, atol=1e-6 + slack), (
-            list(CONTENTS)[regions[row]],
-            PLACES[row % len(PLACES)],
-        )
+    share = np.where(data.tables.buckets.numpy() > 0, data.tables.exploration.numpy(), 1.0)[regions]
+    sums = explores.sum(axis=1)
+    whole = np.abs(sums - 1) < 1e-4
+    faces = np.array([face for face, _ in PLACES])[np.arange(len(sums)) % len(PLACES)]
+    assert np.array_equal(whole, (faces != ROOF) | (explores_by == "table"))
+    assert (sums <= 1 + 1e-4).all() and (sums[~whole] < 0.9).all()
+    assert np.allclose(pdfs.sum(axis=1), 1 - share * (1 - sums), atol=2e-5)
+    assert (pdfs.sum(axis=1) <= 1 + 2e-5).all()
+    weights = asked(weigh_lights, data, frame, spots)
+    assert (pdfs[weights > 0] > 0).all(), "a light that nothing selects, though it shines there"
+    assert explores_by == "hierarchy" or (pdfs > 0).all()
 
 
-def test_choices_follow_the_probabilities():
-    frame, data, held, spots = lit_cache()
+@both_ways
+@both_caches
+def test_probabilities_are_those_of_the_weights(kind, explores_by):
+    """However many lights are weighed at once, by whatever means; of every sort of light, on every sort of surface."""
+    frame, data, spots = CACHES[kind](explores_by)
+    pdfs = probabilities(frame, data, spots)
+    expected, slack, weights = expected_probabilities(frame, data, spots)
+    assert (weights >= 0).all() and (weights > 0).mean() > 0.2
+    off = np.abs(pdfs - expected)
+    for row in np.flatnonzero((off > 1e-6 + slack).any(axis=1)):
+        raise AssertionError((spots.regions.numpy()[row], PLACES[row % len(PLACES)], np.argmax(off[row] - slack[row])))
+    metal = np.array([face == METAL_FLOOR for face, _ in PLACES])[np.arange(len(pdfs)) % len(PLACES)]
+    assert np.median(slack[~metal] / expected[~metal].clip(1e-9)) < 0.01 and np.median(slack[metal]) < 0.01
+
+
+@both_ways
+@both_caches
+def test_choices_follow_the_probabilities(kind, explores_by):
+    frame, data, spots = CACHES[kind](explores_by)
     pdfs = probabilities(frame, data, spots)
     rng = np.random.default_rng(2)
-    numbers = (rng.integers(0, 1 << 24, (20_000, 2)) / (1 << 24)).astype(np.float32)
+    numbers = (rng.integers(0, 1 << 24, (10_000, 2)) / (1 << 24)).astype(np.float32)
     numbers[:3] = [(0.0, 0.0), (1 - 2**-24, 1 - 2**-24), (1 - 2**-24, 0.0)]
     items, chosen, new = choices(frame, data, spots, numbers)
-    assert items.min() >= 0 and items.max() < 203
+    assert items.min() >= -1 and items.max() < 203
     rows = np.arange(len(items))[:, None]
-    assert np.allclose(chosen, pdfs[rows, items], rtol=1e-5)
+    assert np.allclose(chosen, np.where(items >= 0, pdfs[rows, items], 0.0), rtol=1e-5)
+    contents = contents_of(data.tables)
+    nothing = np.zeros(len(items), bool)
     for row, region in enumerate(spots.regions.numpy()):
-        p = chi_squared(np.bincount(items[row], minlength=203), pdfs[row] * len(numbers))
-        assert p > 1e-5, (list(CONTENTS)[region], PLACES[row % len(PLACES)])
-        unknown = ~np.isin(items[row], list(held[region]))
+        found = items[row][items[row] >= 0]
+        nothing[row] = len(found) < len(numbers)
+        total = len(numbers) if nothing[row] else None
+        p = chi_squared(np.bincount(found, minlength=203), pdfs[row] * len(numbers), total)
+        assert p > 1e-5, (region, PLACES[row % len(PLACES)])
+        unknown = ~np.isin(items[row], [e for held in contents[region][0] for e in held])
         assert np.array_equal(new[row] != 0, unknown)
+    sums = pdfs.sum(axis=1)
+    assert (sums[nothing] < 0.9999).all() and (explores_by == "hierarchy") == nothing.any()
 
 
-def test_every_light_can_be_explored():
-    """Where a twentieth explores, a float32 has a twentieth of its numbers left: too few for many lights."""
-    count, share = 1 << 19, 0.02
-    frame, data, _, spots = lit_cache()
-    data.tables, _ = table([([40], 1, share), ([43], 8, share)])
+@both_ways
+def test_every_light_can_be_explored(explores_by):
+    """Where a thousandth explores, a float32 has a thousandth of its numbers left: too few for many lights."""
+    count, share = 1 << 15, 0.001
+    frame, data, _ = lit_cache(explores_by)
+    data.tables = table([([40], [43], 8, share)])
     frame.data.emitters.count = count
-    frame.data.emitters.alias = AliasTable.build(np.ones(count)).on(device())
     rng = np.random.default_rng(3)
-    numbers = rng.integers(0, 1 << 24, (1 << 21, 2)) / (1 << 24)
-    numbers[:, 0] = np.floor(numbers[:, 0] * share * (1 << 24)) / (1 << 24)
+    if explores_by == "hierarchy":
+        places = np.stack([*rng.uniform(-9, 9, (2, count)), rng.uniform(8, 9, count)], axis=1)[:, [0, 2, 1]]
+        ones = np.ones(count)
+        up = np.tile([0.0, 1.0, 0.0], (count, 1))
+        bounds = EmitterBounds(places, places, up, np.pi * ones, ones, ones, np.zeros(count, bool), ones)
+        data.tree = to_device(build_tree(bounds), device())
+    else:
+        frame.data.emitters.alias = AliasTable.build(np.ones(count)).on(device())
+    spots = Spots()
     spots.faces, spots.regions = array([FLOOR]), array([0])
     spots.views = array([VIEWS["above"]], wp.vec3)
+    pdfs = explored(frame, data, spots)[0]
+    assert abs(pdfs.sum() - 1) < 1e-3
+    numbers = rng.integers(0, 1 << 24, (1 << 17, 2)) / (1 << 24)
+    numbers[:, 0] = np.floor(numbers[:, 0] * share * (1 << 24)) / (1 << 24)
     items, _, _ = choices(frame, data, spots, numbers.astype(np.float32))
-    found, expected = len(np.unique(items)) / count, 1 - np.exp(-len(numbers) / count)
+    found, expected = len(np.unique(items)) / count, (1 - np.exp(-len(numbers) * pdfs)).mean()
     assert abs(found - expected) < 0.01, f"{found:.1%} of the lights, not {expected:.1%}"
 
 
-def shares_of_lights(frame, data, spots, row, emitters, buckets, exploration):
-    """Return the probability of each of ``emitters`` within its bucket."""
+def shares_of_lights(frame, data, spots, row, emitters, exploration):
+    """Return the probability of each of ``emitters``, those of a region's only bucket, within it."""
     pdf = probabilities(frame, data, spots)[row, emitters]
-    alias = frame.data.emitters.alias.numpy()["pdf"][emitters]
-    return (pdf - exploration * alias) * buckets / (1 - exploration)
+    return (pdf - exploration * explored(frame, data, spots)[row, emitters]) / (1 - exploration)
 
 
 def test_lights_are_selected_by_what_they_reflect():
     """Lambert: emitted radiance times cosines over square distance, by 4,096 points; and lights without size."""
-    frame, data, _, spots = lit_cache()
+    frame, data, spots = lit_cache()
     emitters = np.array([0, 1, 4, 5, 2, 3, 10, 14, 200, 201, 202])  # down, both sides, turned away; point, spot, sun
-    data.tables, _ = table([(emitters, 1, 0.1)])
+    data.tables = table([(emitters, [], 0, 0.1)])
     spots.faces, spots.regions = array([FLOOR]), array([0])
     spots.views = array([VIEWS["above"] / np.linalg.norm(VIEWS["above"])], wp.vec3)
-    found = shares_of_lights(frame, data, spots, 0, emitters, 1, 0.1)
+    found = shares_of_lights(frame, data, spots, 0, emitters, 0.1)
 
     geometry = frame.data.geometry
     points, faces = geometry.points.numpy().astype(float), geometry.indices.numpy()
@@ -371,11 +589,86 @@ LUMINANCE_OF_FLOOR = LUMINANCE * [0.5, 0.4, 0.3]
 
 def test_lights_that_reflect_nothing_are_equal():
     """Not a division by zero: a bucket whose lights are all below the horizon."""
-    frame, data, held, spots = lit_cache()
-    row = list(CONTENTS).index("turned away") * len(PLACES)
-    emitters = sorted(held[row // len(PLACES)])
-    found = shares_of_lights(frame, data, spots, row, emitters, 1, 0.1)
+    frame, data, spots = lit_cache("table")
+    region = list(CONTENTS).index("turned away")
+    emitters = contents_of(data.tables)[region][0][0]
+    found = shares_of_lights(frame, data, spots, region * len(PLACES), emitters, 0.1)
     assert np.allclose(found, 1 / len(emitters), atol=1e-5)
+
+
+# ---- weights, eight at a time ----
+
+SURFACES = {"lambert": (0.0, 1.0, -1.0), "coated": (0.0, 0.3, 1.0), "metal": (1.0, 0.3, 1.0), "mirror": (1.0, 0.1, 1.0)}
+
+
+def lane_points(count, material):
+    """Points of any orientation, and triangles of all sizes around them; every bucket has other lights."""
+    rng = np.random.default_rng(6)
+    points = LanePoints()
+    origins = rng.normal(size=(count, 3))
+    rotations = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    rotations *= np.sign(np.linalg.det(rotations))[:, None, None]
+    wo = rng.normal(size=(count, 3))
+    wo[:, 2] = np.abs(wo[:, 2]) + 0.05
+    wo /= np.linalg.norm(wo, axis=1, keepdims=True)
+    wo[0] = 0, 0, 1
+    size = 32 * count + 5
+    away = rng.normal(size=(size, 1, 3))
+    distance = 10.0 ** rng.uniform(-1, 1.5, (size, 1, 1))
+    away *= distance / np.linalg.norm(away, axis=2, keepdims=True)
+    around = np.concatenate([np.zeros((5, 3)), origins.repeat(32, axis=0)])[:, None]
+    corners = around + away + rng.normal(size=(size, 3, 3)) * distance * 10.0 ** rng.uniform(-2.5, 0.3, (size, 1, 1))
+    shapes = np.zeros(size, light_cache_native.LightShape.numpy_dtype())
+    for i, name in enumerate(("p0", "p1", "p2")):
+        shapes[name] = corners[:, i]
+    shapes["luminance"] = rng.uniform(0.1, 10, size) * (rng.random(size) < 0.9)
+    shapes["two_sided"] = rng.integers(0, 2, size)
+    order = rng.permutation(size)  # emitters are anywhere
+    place = np.empty(size, np.int64)
+    place[order] = np.arange(size)
+    points.origins, points.shadings = array(origins, wp.vec3), array(rotations, wp.mat33)
+    points.views, points.materials = array(wo, wp.vec3), array(np.tile(material, (count, 1)), wp.vec3)
+    points.counts, points.items = array(np.arange(count) % 32 + 1), array(place)
+    points.shapes = wp.array(shapes[order], dtype=light_cache_native.LightShape, device=device())
+    return points, shapes[5:].reshape(count, 32)
+
+
+@pytest.mark.parametrize("material", SURFACES)
+def test_lanes_weigh_as_one_by_one(material):
+    """Which lights are left out, which are dark; the others differ by no more than ROUNDING."""
+    count = 32 * 40
+    points, shapes = lane_points(count, SURFACES[material])
+    found = wp.full((count, 32), np.nan, dtype=wp.float32, device=device())
+    weights, backs = (wp.empty((count, 32), dtype=wp.float32, device=device()) for _ in range(2))
+    heights = wp.empty((count, 32), dtype=wp.vec4, device=device())
+    launch(weigh_in_lanes, count, [points, ltc_table(device()), found], device())
+    launch(weigh_one_by_one, 32 * count, [points, ltc_table(device()), weights, heights, backs], device())
+    found, weights, backs, heights = (x.numpy().astype(np.float64) for x in (found, weights, backs, heights))
+    there = np.arange(32) < points.counts.numpy()[:, None]
+    assert np.isfinite(found[there]).all() and np.isnan(found[~there]).all()
+    if device().is_cuda:
+        assert (found[there] == LEFT_OUT).all()
+        return
+    low, high, lobe_low, lobe_high = np.moveaxis(heights, 2, 0)
+    no_size = shapes["luminance"] == 0
+    dark = (high <= 0) | ((backs >= 0) & (shapes["two_sided"] == 0))
+    crosses = (low <= 0) & (high > 0)
+    if material != "lambert":
+        crosses |= (lobe_low <= 0) & (lobe_high > 0)
+    margin = np.minimum.reduce([np.abs(x) for x in (low, high, lobe_low, lobe_high, backs)])
+    sure = there & ((margin > 1e-4) | (material == "lambert") & (np.minimum(np.abs(low), np.abs(high)) > 1e-4))
+    sure &= np.abs(backs) > 1e-4
+    assert sure[there].mean() > 0.97
+    left_out, none = no_size | (crosses & ~dark), ~no_size & dark
+    assert (found[sure & left_out] == LEFT_OUT).all() and (found[sure & none] == 0).all()
+    weighed = sure & ~left_out & ~none
+    assert min((sure & x).sum() for x in (no_size, crosses & ~dark & ~no_size, none, weighed)) > 500
+    for width in range(1, 9):  # of the last group of eight
+        assert (weighed & (points.counts.numpy() % 8 == width % 8)[:, None]).sum() > 500
+    off = np.abs(found - weights)[weighed]
+    assert (off <= ROUNDING[0] * weights[weighed] + ROUNDING[1] * shapes["luminance"][weighed]).all()
+    assert material != "lambert" or (off < 2e-4 * weights[weighed]).mean() > 0.9
+    assert (found[weighed] > 0).all()
 
 
 # ---- exploration: weights of all lights, moving ones ----
@@ -391,20 +684,17 @@ def moving_scene():
     return gi.Scene([floor, gi.Node("moves", [lamp], keyframes=keys), gi.Node("stays", [still])], lights)
 
 
-def explored(frame):
-    return frame.data.emitters.alias.numpy()["pdf"].astype(float)
-
-
 def test_exploration_follows_power():
-    frame, _ = preprocessed(lit_scene(), gi.VisibilityLightCache(change=0.0, distance=0.0))
+    frame, _ = preprocessed(lit_scene(), gi.VisibilityLightCache(explores_by="table", change=0.0, distance=0.0))
     powers = lit_scene().emitter_powers()
-    assert np.allclose(explored(frame), powers / powers.sum(), rtol=1e-4, atol=1e-7)
+    assert np.allclose(explored_by_table(frame), powers / powers.sum(), rtol=1e-4, atol=1e-7)
 
 
 def test_exploration_follows_nearness_to_the_camera():
     scene = moving_scene()
-    frame, _ = preprocessed(scene, gi.VisibilityLightCache(energy=0.0, change=0.0), position=(0.0, 1.0, -0.5))
-    found = explored(frame)
+    estimator = gi.VisibilityLightCache(explores_by="table", energy=0.0, change=0.0)
+    frame, _ = preprocessed(scene, estimator, position=(0.0, 1.0, -0.5))
+    found = explored_by_table(frame)
     places = np.array(
         [[-1.3, 2, 0.1], [-1.4, 2, 0.2], [1 + 0.2 / 3, 1, 1 + 0.2 / 3], [1 + 0.1 / 3, 1, 1 + 0.4 / 3], [0, 1, -1]]
     )
@@ -414,19 +704,43 @@ def test_exploration_follows_nearness_to_the_camera():
 
 def test_exploration_goes_after_lights_that_move():
     scene = moving_scene()
-    estimator = gi.VisibilityLightCache(energy=0.1, change=10.0, distance=0.0, exploration=0.2)
+    estimator = gi.VisibilityLightCache(explores_by="table", energy=0.1, change=10.0, distance=0.0, exploration=0.2)
     frame, state = preprocessed(scene, estimator)
-    before = explored(frame)
+    before = explored_by_table(frame)
     state.tables.exploration.fill_(0.03)
     frame, state = preprocessed(scene, estimator, state, 0.5)
-    assert explored(frame)[:2].sum() > 0.98 > before[:2].sum()
+    assert explored_by_table(frame)[:2].sum() > 0.98 > before[:2].sum()
     assert np.allclose(state.tables.exploration.numpy(), 0.2), "what is known is in doubt"
     state.tables.exploration.fill_(0.03)
     frame, state = preprocessed(scene, estimator, state, 0.5)  # now it stands still
-    assert np.allclose(explored(frame), before)
+    assert np.allclose(explored_by_table(frame), before)
     assert np.allclose(state.tables.exploration.numpy(), 0.03)
     shapes = state.shapes.numpy()
     assert np.allclose(shapes["p0"][0], (-0.5, 2, 0), atol=1e-5)
+
+
+def test_the_hierarchy_follows_lights_that_move():
+    scene, estimator = moving_scene(), gi.VisibilityLightCache(exploration=0.2)
+    spots = Spots()
+    spots.faces, spots.regions, spots.views = array([0]), array([0]), array([(0.0, 1.0, 0.0)], wp.vec3)
+
+    def chances(frame):
+        assert frame.lights.data.explores_by_tree == 1
+        found = asked(ask_hierarchy, frame.lights.data.tree, frame, spots)
+        assert np.allclose(found, probabilities(frame, frame.lights.data, spots), rtol=1e-5)  # nothing is cached
+        return found
+
+    frame, state = preprocessed(scene, estimator)
+    before = chances(frame)
+    state.tables.exploration.fill_(0.03)
+    frame, state = preprocessed(scene, estimator, state, 0.5)
+    after = chances(frame)
+    assert np.allclose(state.tables.exploration.numpy(), 0.2), "what is known is in doubt"
+    fresh, _ = preprocessed(scene, estimator, None, 0.5)
+    assert np.allclose(after, chances(fresh), rtol=1e-3) and not np.allclose(after, before, rtol=5e-3)
+    state.tables.exploration.fill_(0.03)
+    _, state = preprocessed(scene, estimator, state, 0.5)  # now it stands still
+    assert np.allclose(state.tables.exploration.numpy(), 0.03)
 
 
 @pytest.mark.parametrize(
@@ -435,15 +749,15 @@ def test_exploration_goes_after_lights_that_move():
 def test_every_light_is_explored_whatever_the_weights(weights):
     """Else estimates are biased: nobody finds a light that stands still. Or such weights are refused."""
     try:
-        estimator = gi.VisibilityLightCache(**weights)
+        estimator = gi.VisibilityLightCache(explores_by="table", **weights)
     except gi.OptionError:
         assert "change" not in weights
         return
     scene = moving_scene()
     frame, state = preprocessed(scene, estimator)
-    assert (explored(frame) > 0).all()
+    assert (explored_by_table(frame) > 0).all()
     frame, _ = preprocessed(scene, estimator, state, 0.5)
-    assert (explored(frame) > 0).all()
+    assert (explored_by_table(frame) > 0).all()
 
 
 # ---- lists of lights ----
@@ -533,8 +847,8 @@ def test_hash_collisions():
     assert found[0] == [e << 8 for e in same]
 
 
-def deep_lesson(seed=3, count=20_000, lights=300):
-    """Samples of a cluster on a tree of many levels, each with a light."""
+def deep_lesson(seed=3, count=20_000, lights=203):
+    """Samples of a cluster on a tree of many levels, each with a light of lit_scene."""
     rng = np.random.default_rng(seed)
     settings = gi.SampleOctree(split=64, collapse=32)
     state = settings.start(SimpleNamespace(bounds=np.array([[0, 0, 0], [1, 1, 1]], np.float32)), device())
@@ -620,6 +934,96 @@ def test_joined_lists_end():
     assert [e >> 8 for e in found[0]] == list(range(MOST_LISTED)) and found[1] == []
 
 
+# ---- which lights matter most to a region ----
+
+
+def importances_of(data, places):
+    """Kernel: float32 [place, emitter] of places (centre, radius)."""
+    out = wp.empty((len(places), data.shapes.shape[0]), dtype=wp.float32, device=device())
+    launch(ask_importances, out.size, [data, array(places, wp.vec4), out], device())
+    return out.numpy()
+
+
+def cells_of(lesson):
+    cells = wp.empty(lesson.octree.leaf_count, dtype=wp.vec4, device=device())
+    launch(ask_cells, cells.size, [lesson.octree.octree, lesson.tree, cells], device())
+    return cells.numpy()
+
+
+def expected_importances(data, places):
+    """Float64: irradiance but for the receiver's slant, by lights as if at their middle and a radius farther away."""
+    shapes, rows = data.shapes.numpy(), data.emitters.numpy()
+    out = np.zeros((len(places), len(rows)))
+    for i, (*center, radius) in enumerate(places.astype(np.float64)):
+        for k, (shape, row) in enumerate(zip(shapes, rows, strict=True)):
+            if row["kind"] == types.EMITTER_TRIANGLE:
+                p0, p1, p2 = (shape[name].astype(np.float64) for name in ("p0", "p1", "p2"))
+                to_place, normal = center - (p0 + p1 + p2) / 3, np.cross(p1 - p0, p2 - p0)
+                area = np.linalg.norm(normal) / 2
+                height = to_place @ normal / (2 * area)  # cosine times distance
+                height = abs(height) if shape["two_sided"] else max(height, 0)
+                out[i, k] = shape["luminance"] * area * (height + radius) / (to_place @ to_place + radius**2) ** 1.5
+                continue
+            out[i, k] = row["intensity"] @ LUMINANCE
+            if row["kind"] != types.EMITTER_DIRECTIONAL:
+                out[i, k] /= ((row["position"] - center) ** 2).sum() + radius**2
+    return out
+
+
+def dimmed_cache():
+    """LightCache of lit_scene, in which every tenth light emits nothing."""
+    frame, _ = preprocessed(lit_scene())
+    data = frame.lights.data
+    shapes = data.shapes.numpy().copy()
+    shapes["luminance"][::10] = 0.0
+    data.shapes = wp.array(shapes, dtype=light_cache_native.LightShape, device=device())
+    return data
+
+
+def test_importance_of_lights():
+    """Of every sort, from afar, from near, and around the light itself."""
+    data = dimmed_cache()
+    rng = np.random.default_rng(8)
+    shapes, rows = data.shapes.numpy(), data.emitters.numpy()
+    centers = rng.uniform(-6, 6, (60, 3))
+    centers[:5], centers[5:8] = shapes["p0"][1:6], rows["position"][[200, 201, 201]]
+    places = np.concatenate([centers, 10 ** rng.uniform(-3, 1, (60, 1))], axis=1).astype(np.float32)
+    found, expected = importances_of(data, places), expected_importances(data, places)
+    assert np.array_equal(expected == 0, found == 0) and (found == 0).sum() == 60 * 20  # 200 is a point light
+    assert np.allclose(found, expected, rtol=2e-4, atol=1e-6)
+    back = ~shapes["two_sided"].astype(bool) & (rows["kind"] == types.EMITTER_TRIANGLE)
+    assert {*rows["kind"]} == {0, 1, 2, 3} and back.any() and (shapes["two_sided"] == 1).any()
+
+
+@pytest.mark.parametrize("capacity", [1, 5, 32])
+def test_lights_that_matter_most(capacity):
+    """Against NumPy's order; lights of equal importance may swap places."""
+    data = dimmed_cache()
+    _, lesson = deep_lesson()
+    rng = np.random.default_rng(capacity)
+    places = cells_of(lesson)
+    leaves = len(places)
+    emitters = [np.sort(rng.choice(203, n, replace=False)) for n in rng.choice([0, 1, 5, 31, 32, 33, 150], leaves)]
+    emitters[3] = np.arange(0, 200, 10)  # that emit nothing
+    given = lists([[int(e) << 8 | 3 for e in x] for x in emitters])
+    given.offsets = array(given.offsets.numpy() + 7)
+    given.entries = array(np.concatenate([np.full(7, -1), given.entries.numpy()]))
+    out = wp.full(given.entries.shape[0], -5.0, dtype=wp.float32, device=device())
+    sums = wp.full(leaves, -5.0, dtype=wp.float32, device=device())
+    inputs = [data, lesson.octree.octree, lesson.tree, given, capacity, out, sums]
+    launch(light_cache_build.rank_lights, leaves, inputs, device())
+    found, expected = out.numpy(), importances_of(data, places)
+    assert (found[:7] == -5).all(), "a leaf that wrote into another's place"
+    for leaf, offset in enumerate(given.offsets.numpy()):
+        here, all_of_them = found[offset : offset + len(emitters[leaf])], expected[leaf, emitters[leaf]]
+        main = here == MAIN
+        assert main.sum() == min(capacity, len(here))
+        assert np.allclose(here[~main], all_of_them[~main], rtol=1e-5)
+        if main.any() and not main.all():
+            assert all_of_them[main].min() >= all_of_them[~main].max() * (1 - 1e-5)
+        assert np.isclose(sums.numpy()[leaf], all_of_them[main].sum(), rtol=1e-5)
+
+
 # ---- buckets ----
 
 
@@ -630,46 +1034,65 @@ def settings_of(capacity=32, memory=4, hysteresis=0.75, exploration=0.1, least=0
     return s
 
 
-def bucketed(emitters, before, capacity):
-    """Buckets (count, [emitters of each]) of regions with these emitters, that had ``before`` buckets."""
+def bucketed(emitters, importances, before, capacity):
+    """CacheTables of regions with these emitters, that had ``before`` buckets."""
     settings, leaves = settings_of(capacity), len(emitters)
-    given = lists([[e << 8 | 1 for e in x] for x in emitters])
-    known, tables = light_cache.CacheTables(), light_cache.CacheTables()
-    known.buckets = array([b | 3 << 16 for b in before][::-1])  # origins are in another order
-    tables.buckets = wp.empty(leaves, dtype=wp.int32, device=device())
+    given = lists([[int(e) << 8 | 1 for e in x] for x in emitters])
+    ranked, sums = [], []
+    for values in importances:
+        main = most_important(values, capacity)
+        sums.append(values[main].sum())
+        ranked.append(np.where(main, MAIN, values))
+    ranked, sums = array(np.concatenate(ranked), wp.float32), array(sums, wp.float32)
+    tables = light_cache.CacheTables()
+    known = array(before[::-1])  # origins are in another order
+    tables.buckets, sizes = (wp.empty(leaves, dtype=wp.int32, device=device()) for _ in range(2))
     tables.exploration = wp.full(leaves, 0.1, dtype=wp.float32, device=device())
-    sizes = wp.empty(leaves, dtype=wp.int32, device=device())
-    origins = array(range(leaves)[::-1])
-    inputs = [settings, given, origins, known, tables, sizes]
+    inputs = [settings, given, ranked, array(range(leaves)[::-1]), known, tables.buckets, sizes]
     launch(light_cache_build.count_buckets, leaves, inputs, device())
     numbers = sizes.numpy().copy()
+    assert np.array_equal(numbers, tables.buckets.numpy() + [len(x) for x in emitters])
     tables.offsets = array(np.cumsum(numbers) - numbers)
     tables.items = wp.full(int(numbers.sum()), -7, dtype=wp.int32, device=device())
-    launch(light_cache_build.fill_buckets, leaves, [settings, given, tables], device())
-    return tables, contents_of(tables)
+    tables.chances = wp.full(int(numbers.sum()), -7.0, dtype=wp.float32, device=device())
+    launch(light_cache_build.fill_buckets, leaves, [settings, given, ranked, sums, tables], device())
+    return tables
 
 
-def contents_of(tables):
-    out = []
-    items = tables.items.numpy()
-    for word, offset in zip(tables.buckets.numpy(), tables.offsets.numpy(), strict=True):
-        count = int(word) & 0xFFFF
-        ends = items[offset : offset + count]
-        begins = np.concatenate([[0], ends[:-1]]) if count else []
-        held = [items[offset + count + b : offset + count + e].tolist() for b, e in zip(begins, ends, strict=True)]
-        assert int(word) >> 16 == sum(not x for x in held)
-        out.append((count, held))
-    return out
+def most_important(values, capacity):
+    """Which lights belong to the first bucket; of equals the first."""
+    main = np.zeros(len(values), bool)
+    main[np.argsort(-np.asarray(values), kind="stable")[:capacity]] = True
+    return main
 
 
-def expected_buckets(emitters, before, capacity):
-    count = 1 if len(emitters) else 0
-    while 0 < count < MOST_BUCKETS:
-        limit = max(int(capacity * 0.75), 1) if count < before else capacity
-        if np.bincount(np.asarray(emitters) % count).max() <= limit:
-            break
-        count *= 2
-    return count, [[int(e) for e in sorted(emitters) if e % count == k][:capacity] for k in range(count)]
+def expected_buckets(emitters, importances, before, capacity):
+    """The first bucket; others in the least power of two of buckets that holds them; the chance of each."""
+    emitters, importances = np.asarray(emitters, int), np.asarray(importances, np.float64)
+    main = most_important(importances, capacity)
+    held = [emitters[main].tolist()] * (len(emitters) > 0)
+    if len(emitters) > capacity:
+        count, rest = 1, emitters[~main]
+        while count < MOST_BUCKETS:
+            limit = max(int(capacity * 0.75), 1) if 1 + count < before else capacity
+            if np.bincount(rest % count).max() <= limit:
+                break
+            count *= 2
+        held += [rest[rest % count == k][:capacity].tolist() for k in range(count)]
+    of = dict(zip(emitters.tolist(), importances, strict=True))
+    brought = np.array([sum(of[e] for e in x) for x in held])
+    filled = np.array([len(x) > 0 for x in held])
+    chances = filled / max(filled.sum(), 1)
+    if brought.sum() > 0:
+        chances = LEAST_CHANCE * chances + (1 - LEAST_CHANCE) * brought / brought.sum()
+    return held, chances
+
+
+def importances_for(rng, count):
+    """Of widely different sizes; or all equal, or zero but for a few, or all zero."""
+    sort = rng.integers(0, 6)
+    values = 10 ** rng.uniform(-12, 6, count)
+    return np.float32([values * (rng.random(count) < 0.05), values * 0 + 3, values * 0, values][min(sort, 3)])
 
 
 @pytest.mark.parametrize("capacity", [1, 2, 5, 32])
@@ -678,33 +1101,48 @@ def test_buckets(capacity):
     rng = np.random.default_rng(capacity)
     emitters, before = [], []
     for pool in (40, 300, 5000, 1 << 23):
-        for count in (0, 1, 2, 20, 24, 25, 32, 33, 64, 100, 300, 1000):
-            for last in (0, 1, 2, 8, 64):
+        for count in (0, 1, 2, 20, 32, 33, 56, 57, 64, 65, 100, 300, 1000):
+            for last in (0, 1, 2, 3, 9, 65):
                 emitters.append(sorted({int(e) for e in rng.integers(0, pool, count)}))
                 before.append(last)
     emitters.append(list(range(0, 64 * 100, 64)))  # all in one bucket of any number
     before.append(0)
-    found = bucketed(emitters, before, capacity)[1]
-    for lights, last, result in zip(emitters, before, found, strict=True):
-        assert result == expected_buckets(lights, last, capacity), (len(lights), last)
+    importances = [importances_for(rng, len(x)) for x in emitters]
+    tables = bucketed(emitters, importances, before, capacity)
+    offsets, ends = tables.offsets.numpy(), tables.chances.numpy()
+    for k, (held, chances) in enumerate(contents_of(tables)):
+        lights, likely = expected_buckets(emitters[k], importances[k], before[k], capacity)
+        assert held == lights, (len(emitters[k]), before[k])
+        assert np.allclose(chances, likely, atol=3e-6)
+        filled = np.array([len(x) > 0 for x in held], bool)
+        assert (chances[~filled] == 0).all() and (chances[filled] >= 0.99 * LEAST_CHANCE / max(len(held), 1)).all()
+        if 0 < len(emitters[k]) <= capacity:
+            assert chances.tolist() == [1.0]
+        if held:
+            assert ends[offsets[k] + len(held) - 1] == 1.0
 
 
 def test_bucket_counts_do_not_flicker():
     counts, before = [], 0
-    for lights in (32, 33, 32, 33, 31, 25, 33, 24, 32, 33):
-        before = bucketed([list(range(lights))], [before], 32)[1][0][0]
-        counts.append(before)
-    assert counts == [1, 2, 2, 2, 2, 2, 2, 1, 1, 2]
+    for lights in (64, 65, 64, 65, 63, 57, 65, 56, 64, 65, 32, 33):
+        before = bucketed([list(range(lights))], [np.ones(lights)], [before], 32).buckets.numpy()[0]
+        counts.append(int(before))
+    assert counts == [2, 3, 3, 3, 3, 3, 3, 2, 2, 3, 1, 2]
 
 
-def test_buckets_that_overflow_leave_lights_to_exploration():
+@both_ways
+def test_buckets_that_overflow_leave_lights_to_exploration(explores_by):
     """Probabilities sum to one all the same, of all lights."""
-    frame, data, _, spots = lit_cache()
-    data.tables, held = bucketed([list(range(203)), list(range(0, 203, 64)), list(range(100))], [0, 0, 64], 1)
-    assert held[0][0] == MOST_BUCKETS and sum(map(len, held[0][1])) == MOST_BUCKETS
-    spots.regions = array(np.arange(spots.faces.shape[0]) // len(PLACES) % 3)
-    pdfs = probabilities(frame, data, spots)
-    assert (pdfs > 0).all() and np.allclose(pdfs.sum(axis=1), 1.0, atol=2e-5)
+    frame, data, _ = lit_cache(explores_by)
+    emitters = [list(range(203)), list(range(0, 203, 64)), list(range(100))]
+    rng = np.random.default_rng(1)
+    data.tables = bucketed(emitters, [rng.uniform(0, 1, len(x)) for x in emitters], [0, 0, 65], 1)
+    held = contents_of(data.tables)[0][0]
+    assert len(held) == 1 + MOST_BUCKETS == sum(map(len, held)) < 203
+    spots = spots_in(np.arange(3))
+    pdfs, explores = probabilities(frame, data, spots), explored(frame, data, spots)
+    assert np.allclose(pdfs.sum(axis=1), 1.0 - 0.1 * (1 - explores.sum(axis=1)), atol=2e-5)
+    assert (pdfs[asked(weigh_lights, data, frame, spots) > 0] > 0).all()
 
 
 # ---- exploration that adapts ----
@@ -737,10 +1175,10 @@ def test_exploration_adapts():
 def test_a_region_knows_what_it_and_its_neighbours_saw():
     """Three frames of learning, each of other samples, against sets."""
     estimator = gi.VisibilityLightCache(memory=1, capacity=8)
-    state = estimator.start(lit_scene(), str(device()), None)
+    frame, state = preprocessed(lit_scene(), estimator)
     known = [[]] * 8
     settings, lesson = deep_lesson(10)
-    for frame in range(3):
+    for turn in range(3):
         origins, neighbours = lesson.origins.numpy(), lesson.neighbours.numpy().reshape(-1, 6)
         starts, counts, order = (getattr(lesson.samples, n).numpy() for n in ("starts", "counts", "order"))
         word = lesson.records.lights.numpy()
@@ -748,19 +1186,26 @@ def test_a_region_knows_what_it_and_its_neighbours_saw():
         for leaf in np.flatnonzero(origins >= 0):
             w = word[order[starts[leaf] : starts[leaf] + counts[leaf]]]
             seen[leaf] = [int(e) << 8 for e in np.unique((w[w >= VISIBLE] & ((1 << 28) - 1)).astype(int) - 1)]
-        before = state.tables.buckets.numpy() & 0xFFFF
+        before = state.tables.buckets.numpy()
         shares = state.tables.exploration.numpy()
         state = estimator.learn(lesson, state)
         expected = expected_join(seen, known, neighbours, origins, 1)
         assert entries_of(state.known) == expected
+        importances = importances_of(frame.lights.data, cells_of(lesson))
+        buckets = []
         for leaf, (found, entries) in enumerate(zip(contents_of(state.tables), expected, strict=True)):
             last = before[origins[leaf]] if origins[leaf] >= 0 else 0
-            assert found == expected_buckets([e >> 8 for e in entries], last, 8)
+            emitters = [e >> 8 for e in entries]
+            held, chances = expected_buckets(emitters, importances[leaf, emitters], last, 8)
+            assert found[0] == held
+            assert np.allclose(found[1], chances, atol=2e-6)
+            buckets.append(len(held))
+        assert max(buckets) > 3 and min(buckets) == 0
         now = state.tables.exploration.numpy()
         kept = (origins >= 0) & (counts == 0)
         assert kept.any() and np.allclose(now[kept], shares[origins[kept]])
         known = expected
-        _, other = deep_lesson(11 + frame, 20_000 // (frame + 1))
+        _, other = deep_lesson(11 + turn, 20_000 // (turn + 1))
         lesson = settings.learn(lesson.octree, other.records, device())
 
 
@@ -768,7 +1213,7 @@ def test_learning_without_samples():
     """A frame that saw nothing but sky forgets no faster than others."""
     estimator = gi.VisibilityLightCache()
     settings, lesson = deep_lesson()
-    state = estimator.learn(lesson, estimator.start(lit_scene(), str(device()), None))
+    state = estimator.learn(lesson, preprocessed(lit_scene(), estimator)[1])
     records = copied(lesson.records, samples.SampleRecords)
     records.codes = wp.full(2000, 0xFFFFFFFF, dtype=wp.uint32, device=device())
     after = estimator.learn(settings.learn(lesson.octree, records, device()), state)
@@ -782,11 +1227,11 @@ def test_threads_do_not_matter():
         for threads in (1, 4):
             set_threads(threads)
             estimator = gi.VisibilityLightCache()
-            state = estimator.start(lit_scene(), str(device()), None)
+            _, state = preprocessed(lit_scene(), estimator)
             for seed in (1, 2):
                 state = estimator.learn(deep_lesson(seed)[1], state)
             t = state.tables
-            used = [x for _, held in contents_of(t) for x in held]
+            used = [(held, chances.tolist()) for held, chances in contents_of(t)]
             results.append((used, *(x.numpy().tolist() for x in (t.buckets, t.offsets, t.exploration))))
     finally:
         set_threads(None)
@@ -803,6 +1248,7 @@ def test_threads_do_not_matter():
         ({"exploration": float("nan")}, "exploration"),
         ({"least_exploration": 0.0}, "least_exploration"),
         ({"least_exploration": 0.2}, "least_exploration"),
+        ({"explores_by": "power"}, "way to explore"),
         ({"memory": -1}, "memory"),
         ({"memory": 201}, "memory"),
         ({"samples": 0}, "samples"),
@@ -821,7 +1267,7 @@ def test_settings_are_checked(settings, message):
 def test_more_lights_than_entries_can_name():
     """An entry has 23 bits for the emitter; beyond, it would be negative."""
     with pytest.raises(gi.OptionError, match="emitters"):
-        gi.VisibilityLightCache().start(SimpleNamespace(emitter_count=(1 << 23) + 1), str(device()), None)
+        gi.VisibilityLightCache().start(SimpleNamespace(emitter_count=(1 << 23) + 1, name="stars"), str(device()), None)
 
 
 # ---- pictures ----
@@ -887,18 +1333,25 @@ def test_scene_without_lights():
         assert np.allclose(frame.numpy("beauty"), 0.5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("moves", [False, True], ids=["still", "moving"])
-def test_pictures_equal_those_by_power(moves):
+@cache
+def by_power(moves, name):
+    """The reference on the device of that name."""
+    return rendered(divided_room(moves), gi.PowerLights(), range(100, 196), (0, 5))
+
+
+@pytest.mark.parametrize(
+    ("moves", "explores_by"),
+    [(False, "hierarchy"), (True, "hierarchy"), (True, "table")],
+    ids=["still", "moving", "moving-table"],
+)
+def test_pictures_equal_those_by_power(moves, explores_by):
     """The first frame, in which nothing is known, and the sixth; and the cache is worth it: lamps are hidden."""
-    scene = divided_room(moves)
-    seeds = range(1, 25)
-    ours = rendered(scene, gi.VisibilityLightCache(), seeds, (0, 5))
-    theirs = rendered(scene, gi.PowerLights(), range(100, 196), (0, 5))
+    ours = rendered(divided_room(moves), gi.VisibilityLightCache(explores_by=explores_by), range(1, 25), (0, 5))
+    theirs = by_power(moves, device().alias)
     for buffer in ours:
         for k, index in enumerate((0, 5)):
             mean, variance = st.mean_and_variance(theirs[buffer][k])
-            st.compare_images(
-                f"light_cache_{buffer}_{index}", ours[buffer][k], mean, variance, 1e-4, 95, noise_ratio=0.5
-            )
+            name = f"light_cache_{explores_by}_{buffer}_{index}"
+            st.compare_images(name, ours[buffer][k], mean, variance, 1e-4, 95, noise_ratio=0.5)
     noise = [np.median(images["emitters"][1].var(axis=0).mean(axis=-1)) for images in (ours, theirs)]
     assert noise[0] < 0.05 * noise[1], noise

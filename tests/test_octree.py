@@ -49,9 +49,16 @@ def find_leaves(
 
 
 @wp.kernel
-def find_slots(first: wp.int32, regions: samples.SampleRegions, slots: wp.array(dtype=wp.int32)):
-    path = first + wp.tid()
-    slots[path] = samples.sample_slot(regions, wp.int64(path))
+def find_slots(first: wp.int32, regions: samples.SampleRegions, lowest_path: wp.int64, slots: wp.array(dtype=wp.int32)):
+    i = first + wp.tid()
+    slots[i] = samples.sample_slot(regions, lowest_path + wp.int64(i))
+
+
+# Thread: a leaf, or the place of one.
+@wp.kernel
+def find_cells(first: wp.int32, cube: octree.Octree, tree: octree.OctreeNodes, cells: wp.array(dtype=wp.vec4)):
+    leaf = first + wp.tid()
+    cells[leaf] = octree.leaf_cell(cube, tree, leaf)
 
 
 def encoded(points, cube):
@@ -180,7 +187,8 @@ def recorded(codes):
     records.codes = wp.array(np.asarray(codes, np.uint32), dtype=wp.uint32, device=device())
     for name in ("lights", "directions", "mixtures"):
         setattr(records, name, wp.zeros(len(codes), dtype=wp.uint32, device=device()))
-    records.contributions = wp.zeros(len(codes), dtype=wp.float32, device=device())
+    for name in ("contributions", "pdfs"):
+        setattr(records, name, wp.zeros(len(codes), dtype=wp.float32, device=device()))
     records.vertices, records.stride = 1, 1
     return records
 
@@ -322,6 +330,22 @@ def test_nodes_know_their_cells():
         assert state.leaf_count == 8 * len(inner)
 
 
+def test_places_of_leaves():
+    """Centre and half of the diagonal, from codes taken apart bit by bit."""
+    edge = (HIGH - LOW).max() * 1.001
+    corner, finest = (LOW + HIGH) / 2 - edge / 2, edge / SIDE
+    for step in steps():
+        cells = step.cells
+        found = wp.empty(step.lesson.octree.leaf_count, dtype=wp.vec4, device=device())
+        inputs = [step.lesson.octree.octree, step.lesson.tree, found]
+        launch(find_cells, found.size, inputs, device())
+        found = found.numpy()[cells.leaves].astype(np.float64)
+        half = finest * (SIDE >> cells.depths) / 2
+        centers = corner + separated(cells.starts) * finest + half[:, None]
+        assert np.allclose(found[:, :3], centers, rtol=0, atol=0.01 * finest)
+        assert np.allclose(found[:, 3], half * np.sqrt(3), rtol=1e-5)
+
+
 # ---- samples ----
 
 
@@ -331,7 +355,9 @@ def test_sample_counts_add_up():
         assert counts[cells.leaves].sum() == len(step.sorted)
         found = np.bincount(cells.leaf_at(step.sorted), minlength=len(cells.leaves))
         assert np.array_equal(counts[cells.leaves], found)
-        assert np.array_equal(step.lesson.samples.counts.numpy()[cells.leaves], found)
+        counted = step.lesson.samples.counts.numpy()
+        assert np.array_equal(counted[cells.leaves], found)
+        assert not np.delete(counted, cells.leaves).any()  # places of inner cells have none
         assert np.array_equal(step.lesson.samples.starts.numpy()[cells.leaves], np.cumsum(found) - found)
         sums = counts.reshape(-1, 8).sum(axis=1)
         within = {node: count_in(step.sorted, *cell) for cell, node in cells.inner.items()}
@@ -495,11 +521,11 @@ def paths_of(resolution, spp):
     return -(-resolution[0] // 8) * -(-resolution[1] // 8) * 64 * spp
 
 
-def slots_of(records, paths):
+def slots_of(records, paths, lowest_path=0):
     regions = samples.SampleRegions()
     regions.octree, regions.records = start().octree, records
     slots = wp.empty(paths, dtype=wp.int32, device=device())
-    launch(find_slots, paths, [regions, slots], device())
+    launch(find_slots, paths, [regions, lowest_path, slots], device())
     return slots.numpy()
 
 
@@ -521,7 +547,7 @@ def test_each_recorded_path_has_its_own_slots(resolution, spp, vertices, most):
     size = records.codes.shape[0]
     assert size < most + vertices and size % vertices == 0
     assert records.stride == 1 or size * records.stride > most - vertices, "thinned more than needed"
-    for name in ("lights", "directions", "contributions", "mixtures"):
+    for name in ("lights", "directions", "contributions", "pdfs", "mixtures"):
         assert getattr(records, name).shape[0] == size
     assert (records.codes.numpy() == EMPTY).all()
     slots = slots_of(records, paths)
@@ -530,6 +556,18 @@ def test_each_recorded_path_has_its_own_slots(resolution, spp, vertices, most):
     assert len(np.unique(slots[kept])) == len(kept)
     groups = np.bincount(kept // records.stride, minlength=-(-paths // records.stride))
     assert groups.max() == 1 and (groups[: paths // records.stride] == 1).all()
+
+
+@pytest.mark.parametrize("lowest", [(1 << 31) - 40_000, (1 << 32) - 40_000, 1 << 35])
+def test_paths_beyond_32_bits(lowest):
+    """As of 8K pictures with 1,024 samples a pixel; of each group one path is recorded, in the place of the group."""
+    records = opened((256, 256), 4, 7, 1 << 20)
+    records.stride = stride = 20_011
+    first = -(-lowest // stride)
+    slots = slots_of(records, 8 * stride, first * stride).reshape(8, stride)
+    assert ((slots >= 0).sum(axis=1) == 1).all()
+    assert np.array_equal(slots.max(axis=1), 7 * (first + np.arange(8)))
+    assert len(np.unique(slots.argmax(axis=1))) > 4
 
 
 @pytest.mark.parametrize("most", [100_000, 30_000, 7000])

@@ -64,8 +64,11 @@ def learnt(scene=None, frames=4, camera=None, **settings):
 
 @cache
 def usual(name):
-    """Return a scheduler and its frame, of the device of that name."""
-    return learnt()
+    """Return a scheduler and its frame, of the device of that name; its shares differ from leaf to leaf."""
+    scheduler, frame = learnt()
+    shares = scheduler.state("indirect").guides.shares
+    shares.assign(np.random.default_rng(1).random((len(shares), 2)).astype(np.float32))
+    return scheduler, frame
 
 
 @pytest.fixture
@@ -303,6 +306,7 @@ def test_quadtree_beside_the_light(scheduler, frame, tmp_path):
     position, normal = frame.numpy("position")[PIXEL[1], PIXEL[0]], frame.numpy("normal")[PIXEL[1], PIXEL[0]]
     light = pictures.incident_light(scheduler, frame, position + 1e-5 * normal, normal)
     coarse = texel_directions(pictures.MAP_TEXELS)
+    assert (light[coarse @ normal < -0.1] == 0).all() and (light[coarse @ normal > 0.1] > 0).mean() > 0.9
     angles = 4 / pictures.MAP_TEXELS**2 * np.abs(coarse).sum(-1) ** 3
     cosines = np.maximum(coarse @ normal, 0)
     true, best = light / (light * angles).sum(), light * cosines / (light * cosines * angles).sum()

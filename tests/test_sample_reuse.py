@@ -1,8 +1,6 @@
-"""Techniques that learn from samples: unbiased in every frame of their adaptation, whatever moves; threads; resuming."""
+"""Techniques that learn from samples: unbiased in every frame, whatever moves; threads; going on from a file."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,8 +9,7 @@ from statistics_tools import every_device  # noqa: F401
 
 import warp_gi as gi
 from warp_gi.bench.presets import sphere
-from warp_gi.errors import OptionError
-from warp_gi.kernels import light_cache
+from warp_gi.errors import BakeError, OptionError
 from warp_gi.launch import set_threads
 
 SIZE = (24, 16)
@@ -79,8 +76,7 @@ def sequences(scene, chosen, frames, count, seed=1):
     pictures = {term: [] for term in TERMS}
     for number in range(count):
         path = gi.CameraPath.still(view())
-        for frame in gi.render(scene, path, chosen, frames, device=st.device().alias, seed=1000 * seed + number):
-            pass
+        *_, frame = gi.render(scene, path, chosen, frames, device=st.device().alias, seed=1000 * seed + number)
         for term in TERMS:
             pictures[term].append(frame.numpy(term).astype(np.float64))
     return {term: np.stack(images) for term, images in pictures.items()}
@@ -118,3 +114,146 @@ def test_unbiased_in_every_frame(references, last, moving):
     else:
         frames = [*range(last + 1)]
     same_pictures(f"reuse_{last}_{moving}", references, moving, frames, pipeline())
+
+
+@pytest.mark.parametrize("change", ["paper", "leaf", "table", "indirect alone"])
+def test_other_ways_are_unbiased_too(references, change):
+    """The paper's settings; a leaf picked by a third number; exploration by a table; directions without a cache."""
+    paper = gi.GuidedPaths(max_depth=5, migrations=1, adapts_share=False, stratified=False, bits=32, fading=0.0)
+    chosen = {
+        "paper": pipeline(indirect=paper),
+        "leaf": pipeline(indirect=gi.GuidedPaths(max_depth=5, stratified=False, bits=64)),
+        "table": pipeline(emitters=gi.VisibilityLightCache(explores_by="table", capacity=6)),
+        "indirect alone": pipeline(emitters=gi.PowerLights(), indirect=gi.GuidedPaths(max_depth=5, bits=96)),
+    }[change]
+    same_pictures(f"reuse_{change}", references, False, [*range(5)], chosen)
+
+
+@pytest.mark.parametrize("moving", [False, True], ids=["still", "moving"])
+def test_the_hierarchy_is_unbiased(references, moving):
+    chosen = pipeline(emitters=gi.LightHierarchy(), indirect=gi.BsdfPaths(max_depth=5))
+    same_pictures(f"hierarchy_{moving}", references, moving, [0, 3, 5] if moving else [0], chosen)
+
+
+def sequence(frames, scene=None, chosen=None, seed=5):
+    """Return a scheduler and the buffers of each frame."""
+    scheduler = gi.FrameScheduler(
+        scene or hall(moving=True), gi.CameraPath.still(view()), chosen or pipeline(), st.device().alias, seed
+    )
+    return scheduler, [buffers(scheduler.frame(index)) for index in frames]
+
+
+def buffers(frame):
+    return {name: frame.numpy(name).copy() for name in frame.names}
+
+
+def assert_same(a, b):
+    for name in a:
+        assert np.array_equal(a[name], b[name]), name
+
+
+def test_threads_do_not_change_a_bit():
+    pictures = []
+    try:
+        for threads in (1, 2, 5):
+            set_threads(threads)
+            pictures.append(sequence(range(5))[1])
+    finally:
+        set_threads(None)
+    for others in pictures[1:]:
+        for one, other in zip(pictures[0], others, strict=True):
+            assert_same(one, other)
+
+
+@pytest.mark.parametrize("stopped", [0, 2])
+def test_a_saved_state_goes_on_bit_for_bit(tmp_path, stopped):
+    """With the octree, caches and quadtrees; whatever moves. In another process there is a new scene, too."""
+    _, unbroken = sequence(range(5))
+    scheduler, _ = sequence(range(stopped + 1))
+    scheduler.save_state(tmp_path / "a.safetensors", "frames")
+    resumed, _ = sequence([])
+    resumed.load_state(tmp_path / "a.safetensors", "frames")
+    for index in range(stopped + 1, 5):
+        assert_same(buffers(resumed.frame(index)), unbroken[index])
+
+
+def test_states_fit_only_their_own(tmp_path):
+    scheduler, _ = sequence([0, 1])
+    path = scheduler.save_state(tmp_path / "a.safetensors", "frames")
+    for other, lineage in (
+        (sequence([], scene=hall(moving=False))[0], "frames"),
+        (sequence([], chosen=pipeline(spp=4))[0], "frames"),
+        (sequence([], seed=6)[0], "frames"),
+        (sequence([])[0], "other frames"),
+    ):
+        with pytest.raises(BakeError, match=r"scene|settings"):
+            other.load_state(path, lineage)
+    path.write_bytes(path.read_bytes()[:-9])
+    with pytest.raises(BakeError, match="truncated"):
+        sequence([])[0].load_state(path, "frames")
+
+
+def test_a_changed_resolution_and_a_cut_camera():
+    """What is learnt is of the scene, not of the picture: other records, the same knowledge, and no bias."""
+    scene = hall()
+    scheduler = gi.FrameScheduler(scene, gi.CameraPath.still(view()), pipeline(), st.device().alias, 3)
+    for index in range(3):
+        scheduler.frame(index)
+    slots = scheduler._records.codes.shape[0]
+    known = scheduler.state("emitters").known.counts.numpy().sum()
+    other = gi.Camera.look_at((1.7, 1.5, 1.8), (0.9, 0.3, -1.5), hfov=70, resolution=(40, 24))
+    scheduler.camera = gi.CameraPath.still(other)
+    cut = [scheduler.frame(index).numpy("emitters").mean() for index in range(3, 35)]
+    assert scheduler._records.codes.shape[0] > slots
+    assert scheduler.state("emitters").known.counts.numpy().sum() > 0 < known
+    plain = gi.FrameScheduler(scene, gi.CameraPath.still(other), pipeline(**PLAIN, spp=64), st.device().alias, 4)
+    truth = [plain.frame(index).numpy("emitters").mean() for index in range(32)]
+    means, variances = zip(*(st.mean_and_variance(np.asarray(x)[:, None]) for x in (cut, truth)), strict=True)
+    assert st.z_test(means[0], variances[0], means[1], variances[1], 1e-4, 31, 31).passed
+
+
+def test_another_sky_keeps_what_was_learnt():
+    scene = hall()
+    scheduler, _ = sequence(range(3), scene)
+    trees = scheduler.state("indirect").guides.trees
+    scene.environment = gi.Environment(pixels=np.full((16, 32, 3), 0.5, np.float32))
+    scheduler.bake()
+    assert scheduler.state("indirect").guides.trees is trees
+    scene.animate("ball", [gi.Keyframe(0.0), gi.Keyframe(1.0, (0.5, 0, 0))])
+    scheduler.bake()
+    assert scheduler.state("indirect").guides.trees.shape == (8,)
+
+
+def test_records_stay_within_their_bound():
+    chosen = pipeline(octree=gi.SampleOctree(split=192, collapse=96, most_samples=1024))
+    scheduler, _ = sequence(range(2), chosen=chosen)
+    assert 0 < scheduler._records.codes.shape[0] <= 1024 + 4
+    assert scheduler.state("octree").counts.numpy()[:8].sum() > 100
+
+
+def test_caches_and_quadtrees_have_less_noise():
+    """The point of it all: where most lamps are hidden, and where light comes from few directions."""
+    scene = hall(sky=False)
+    learnt = [frames["beauty"] for frames in sequence(range(24), scene)[1][8:]]
+    plain = [frames["beauty"] for frames in sequence(range(16), scene, pipeline(**PLAIN))[1]]
+    assert np.var(learnt, axis=0).mean() < 0.5 * np.var(plain, axis=0).mean()
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: gi.VisibilityLightCache(capacity=0), "capacity must be from 1 to 32, got 0"),
+        (lambda: gi.VisibilityLightCache(exploration=0.0), "exploration must be above 0"),
+        (lambda: gi.VisibilityLightCache(least_exploration=0.5), "least_exploration"),
+        (lambda: gi.VisibilityLightCache(explores_by="tabel"), "did you mean 'table'"),
+        (lambda: gi.VisibilityLightCache(explores_by="table", energy=0.0, distance=0.0), "above 0"),
+        (lambda: gi.GuidedPaths(bits=48), "bits must be one of 32, 64, 96, 128, got 48"),
+        (lambda: gi.GuidedPaths(bsdf_share=0.0), "bsdf_share"),
+        (lambda: gi.GuidedPaths(fading=1.0), "fading"),
+        (lambda: gi.GuidedPaths(max_depth=1), "max_depth"),
+        (lambda: gi.SampleOctree(split=10, collapse=20), "collapse must be from 1 to split"),
+    ],
+)
+def test_settings_are_checked(make, words):
+    with pytest.raises(OptionError, match=words):
+        make()

@@ -235,6 +235,8 @@ def run(options: Render, report: Reporter) -> None:
         check_writable(options.reuse_pictures)
     if todo:
         check_writable(options.output.parent)
+        if scheduler.learns:
+            remove_stale_parts(state_path(options))
     if len(todo) < len(shots):
         report.line(f"{len(shots) - len(todo)} of {len(shots)} frames are there already")
     started = time.perf_counter()

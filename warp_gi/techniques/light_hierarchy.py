@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+import warp as wp
 
+from warp_gi import launch
 from warp_gi.estimator import Estimator, SamplerInUse
 from warp_gi.kernels import light_hierarchy, path_trace
 from warp_gi.techniques import light_tree
@@ -27,11 +29,15 @@ class LightHierarchy(Estimator):
         """Return a hash of all but the sky."""
         return scene.contents_hash
 
+    def start(self, scene: Any, device: str, bake: Any, seed: int = 0) -> TreeState | None:
+        """Return the tree over the lights at time 0."""
+        return first_tree(scene, launch.get_device(device))
+
     def preprocess(self, frame: Any, state: TreeState | None) -> TreeState | None:
         """Bring the tree up to the frame's lights, and give it to the paths."""
-        state = tree_of(frame, state)
         if state is None:
             return None
+        state = moved_tree(frame, state)
         frame.lights = SamplerInUse(light_hierarchy.HIERARCHY_LIGHTS, state.data)
         return state
 
@@ -49,14 +55,21 @@ class TreeState:
     data: light_hierarchy.LightTree
 
 
-def tree_of(frame: Any, state: TreeState | None) -> TreeState | None:
-    """Return the tree over a frame's lights, from that of the frame before; None if there are none."""
-    if frame.scene.emitter_count == 0:
+def first_tree(scene: Any, device: wp.Device) -> TreeState | None:
+    """Return the tree over a scene's lights at time 0, whichever time it is at; None if there are none.
+
+    Its shape stays, so that frames do not depend on which of them was the first.
+    """
+    if scene.emitter_count == 0:
         return None
-    if state is None:
-        bounds = light_tree.emitter_bounds(frame.scene, frame.data)
-        tree = light_tree.build_tree(bounds)
-        return TreeState(tree, bounds, light_tree.to_device(tree, frame.device))
+    scene.update(0.0, device=device)
+    bounds = light_tree.emitter_bounds(scene, scene.data(device))
+    tree = light_tree.build_tree(bounds)
+    return TreeState(tree, bounds, light_tree.to_device(tree, device))
+
+
+def moved_tree(frame: Any, state: TreeState) -> TreeState:
+    """Return the tree with its boxes and cones around the lights of a frame."""
     if frame.scene.is_animated:
         bounds = light_tree.emitter_bounds(frame.scene, frame.data)
         if not _same(bounds, state.bounds):

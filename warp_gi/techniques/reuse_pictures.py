@@ -217,7 +217,7 @@ def _draw_quadtree(
     title = (
         f"Pixel ({pixel[0]}, {pixel[1]}), frame {frame.index}. Left: luminance of the light that comes to its point, "
         "path traced, but for what comes straight from emitters. Middle: best density for a Lambert surface there, "
-        f"that light times the cosine. Right: density of its leaf's quadtree, {len(np.unique(cells))} cells to be seen. "
+        f"that light times the cosine. Right: density of its leaf's quadtree, {len(np.unique(cells))} cells in sight. "
         "All directions, seen from above: +y in the middle, x right, z down."
     )
     gap = np.full((MAP_PIXELS, GAP, 3), NOTHING_COLOR, np.uint8)

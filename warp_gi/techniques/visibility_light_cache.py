@@ -13,7 +13,7 @@ from warp_gi.alias import AliasTable
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.estimator import Estimator, SamplerInUse
 from warp_gi.kernels import light_cache, light_cache_build, light_cache_native, path_trace, types
-from warp_gi.techniques.light_hierarchy import TreeState, tree_of
+from warp_gi.techniques.light_hierarchy import TreeState, first_tree, moved_tree
 from warp_gi.techniques.ltc import ltc_table
 from warp_gi.techniques.sample_octree import Lesson, running_sums
 
@@ -94,8 +94,9 @@ class VisibilityLightCache(Estimator):
                 f"{scene.emitter_count:,}; use LightHierarchy"
             )
         device = launch.get_device(device)
+        tree = first_tree(scene, device)
         centers = _places(scene.data(device))[0]
-        return CacheState(_tables(8, device, self.exploration), _lists(8, device), centers)
+        return CacheState(_tables(8, device, self.exploration), _lists(8, device), centers, tree)
 
     def preprocess(self, frame: Any, state: CacheState | None) -> CacheState | None:
         """Bring the shapes of lights and the table of exploration up to the frame, and give paths the cache."""
@@ -122,7 +123,7 @@ class VisibilityLightCache(Estimator):
         cache.shapes, cache.emitters = state.shapes, state.emitters
         cache.ltc, cache.tables = ltc_table(device), state.tables
         if self.explores_by == "hierarchy":
-            state = replace(state, tree=tree_of(frame, state.tree))
+            state = replace(state, tree=moved_tree(frame, state.tree))
             cache.explores_by_tree, cache.tree = 1, state.tree.data
         else:
             emitters.alias = AliasTable.build(self._table(frame, powers, moved, centers)).on(device)
@@ -192,12 +193,12 @@ class CacheState:
     """Every region's lights with the frames since they were seen, of which the tables are made."""
     centers: np.ndarray
     """float64 [emitter, 3] metres, in the last frame."""
+    tree: TreeState = field(metadata={"derived": True})
+    """For exploration."""
     shapes: wp.array | None = field(default=None, metadata={"derived": True})
     """LightShape [emitter]; None before the first frame."""
     emitters: wp.array | None = field(default=None, metadata={"derived": True})
     """Emitter [emitter] of the scene; None before the first frame."""
-    tree: TreeState | None = field(default=None, metadata={"derived": True})
-    """For exploration; None before the first frame."""
 
 
 def _tables(leaves: int, device: wp.Device, exploration: float) -> light_cache.CacheTables:
