@@ -24,7 +24,8 @@ INFINITE_DISTANCE = wp.constant(wp.float32(1.0e30))
 class LightChoice:
     item: wp.int32  # -1: none
     pdf: wp.float32  # probability of selecting it
-    is_new: wp.int32  # 1: no one would have selected it but for exploration
+    explores: wp.float32  # share of samples that explore, of one who does
+    by_exploring: wp.float32  # probability that such a sample, selecting this emitter, explored
 
 
 # radiance is over pdf already for lights without size (delta = 1), whose pdf is the

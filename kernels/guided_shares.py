@@ -8,7 +8,7 @@ samples, and the one with the least sum is taken. Sums of earlier frames fade.
 import warp as wp
 
 from warp_gi.kernels.light_cache_build import LeafSamples
-from warp_gi.kernels.samples import SURFACE_GLOSSY, SampleRecords
+from warp_gi.kernels.samples import SURFACE_GLOSSY, SampleRecords, mixture_densities
 
 wp.set_module_options({"enable_backward": False})
 
@@ -99,17 +99,13 @@ def adapt_shares(
         i = wp.int32(wp.int64(k) * wp.int64(count) / wp.int64(looks))
         slot = samples.order[samples.starts[leaf] + i]
         contribution = records.contributions[slot]
-        if contribution > 0.0:
-            word = records.mixtures[slot]
-            share = wp.float32(word >> wp.uint32(16)) / 65535.0
-            posterior = wp.float32(word & wp.uint32(0xFFFF)) / 65535.0
-            by_bsdf = posterior / share  # density of the BSDF alone over that of the mixture
-            by_guide = (1.0 - posterior) / (1.0 - share)
+        if contribution > 0.0 and contribution < 1.0e18:  # its square is finite
+            densities = mixture_densities(records.mixtures[slot])
             square = contribution * contribution
             is_glossy = (records.lights[slot] & SURFACE_GLOSSY) != wp.uint32(0)
             for c in range(SHARES):
                 a = candidate_share(c)
-                moment = square / wp.max(a * by_bsdf + (1.0 - a) * by_guide, 1.0e-6)
+                moment = square / wp.max(a * densities[0] + (1.0 - a) * densities[1], 1.0e-6)
                 if is_glossy:
                     glossy[c] = glossy[c] + moment
                 else:

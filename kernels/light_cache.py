@@ -27,6 +27,10 @@ wp.set_module_options({"enable_backward": False})
 MOST_BUCKETS = wp.constant(64)  # of a region
 
 
+EXPLORATIONS = 6  # shares of exploration that are tried
+ExplorationMoments = wp.types.vector(length=EXPLORATIONS, dtype=wp.float32)
+
+
 # The lights of every region.
 @wp.struct
 class CacheTables:
@@ -35,6 +39,7 @@ class CacheTables:
     items: wp.array(dtype=wp.int32)  # of each leaf: where its buckets end, then the emitters bucket by bucket
     chances: wp.array(dtype=wp.float32)  # of each leaf: of its buckets up to this one together; 1 for the last
     exploration: wp.array(dtype=wp.float32)  # [leaf] share of samples that explore
+    moments: wp.array(dtype=ExplorationMoments)  # [leaf] what adapt_exploration learns it from
 
 
 @wp.struct
@@ -128,7 +133,6 @@ def find_light(tables: CacheTables, region: CacheRegion, emitter: wp.int32) -> B
 @wp.func
 def explored_light(cache: LightCache, scene: SceneData, s: Surface, u: wp.vec2) -> LightChoice:
     r = LightChoice()
-    r.is_new = 1
     if cache.explores_by_tree != 0:
         by_tree = hierarchy_choice(cache.tree, ray_origin(s), shading_normal(s), u[0], u[1])
         r.item = by_tree.item
@@ -204,16 +208,14 @@ def cached_light(
     found = BucketPlace()
     found.place = -1
     rest = float(0.0)
+    explored_pdf = float(0.0)
     if u[0] < here.explores:
         stretch = 1.0 / here.explores  # of what is left of u[0], whose digits u[1] continues
         rest = wp.min(u[0] * stretch, LARGEST_FLOAT_BELOW_ONE)
-        r = explored_light(cache, scene, s, wp.vec2(rest, wp.min(u[1] * stretch, LARGEST_FLOAT_BELOW_ONE)))
-        r.pdf = here.explores * r.pdf
+        r = explored_light(cache, scene, s, wp.vec2(rest, u[1] * stretch))
+        explored_pdf = here.explores * r.pdf
         if r.item >= 0:
             found = find_light(cache.tables, here, r.item)
-        if found.place < 0:
-            return r
-        r.is_new = 0
     else:
         rest = (u[0] - here.explores) / (1.0 - here.explores)
         number = int(0)
@@ -223,18 +225,24 @@ def cached_light(
         if number > 0:
             rest = rest - cache.tables.chances[here.items + number - 1]
         rest = wp.clamp(rest / found.bucket.chance, 0.0, LARGEST_FLOAT_BELOW_ONE)
-    weighed = weigh_bucket(cache, s, wo, found.bucket)
-    if found.place < 0:
-        left = rest * weighed.total
-        for k in range(found.bucket.count):
-            if weighed.weights[k] > 0.0:
-                found.place = k  # the last one that can be selected, should rounding leave something
-                if left < weighed.weights[k]:
-                    break
-                left = left - weighed.weights[k]
-        r.item = cache.tables.items[found.bucket.begin + found.place]
-        r.pdf = here.explores * explored_light_pdf(cache, scene, s, r.item)
-    r.pdf = r.pdf + (1.0 - here.explores) * found.bucket.chance * weighed.weights[found.place] / weighed.total
+    r.pdf = explored_pdf
+    if found.place >= 0 or u[0] >= here.explores:
+        weighed = weigh_bucket(cache, s, wo, found.bucket)
+        if found.place < 0:
+            left = rest * weighed.total
+            for k in range(found.bucket.count):
+                if weighed.weights[k] > 0.0:
+                    found.place = k  # the last one that can be selected, should rounding leave something
+                    if left < weighed.weights[k]:
+                        break
+                    left = left - weighed.weights[k]
+            r.item = cache.tables.items[found.bucket.begin + found.place]
+            explored_pdf = here.explores * explored_light_pdf(cache, scene, s, r.item)
+        share = (1.0 - here.explores) * found.bucket.chance
+        r.pdf = explored_pdf + share * weighed.weights[found.place] / weighed.total
+    r.explores = here.explores
+    if r.pdf > 0.0:
+        r.by_exploring = explored_pdf / r.pdf
     return r
 
 

@@ -11,9 +11,9 @@ future work (section 8).
 import warp as wp
 
 from warp_gi.kernels.bsdf import luminance
-from warp_gi.kernels.light_cache import MOST_BUCKETS, CacheTables, LightCache
+from warp_gi.kernels.light_cache import EXPLORATIONS, MOST_BUCKETS, CacheTables, ExplorationMoments, LightCache
 from warp_gi.kernels.octree import NEIGHBOURS, Octree, OctreeNodes, leaf_cell
-from warp_gi.kernels.samples import LIGHT_ITEM, LIGHT_NEW, LIGHT_VISIBLE
+from warp_gi.kernels.samples import LIGHT_ITEM, LIGHT_VISIBLE, SampleRecords, mixture_densities
 from warp_gi.kernels.types import EMITTER_DIRECTIONAL, EMITTER_TRIANGLE
 
 wp.set_module_options({"enable_backward": False})
@@ -47,8 +47,6 @@ class CacheSettings:
     capacity: wp.int32  # lights a bucket
     hysteresis: wp.float32  # share of the capacity that must suffice for fewer buckets than before
     memory: wp.int32  # frames that a light stays after it was last seen
-    exploration: wp.float32  # largest share of samples that explore
-    least_exploration: wp.float32
 
 
 # Ascending order, by Shell's method.
@@ -69,15 +67,9 @@ def sort_entries(entries: wp.array(dtype=wp.int32), begin: wp.int32, count: wp.i
 
 
 # Thread: a leaf. Lists the lights that its samples saw in the place of its samples, twice as wide, by way of a hash
-# table there; and counts samples that saw a light which exploration alone had found.
+# table there.
 @wp.kernel
-def list_seen_lights(
-    first: wp.int32,
-    samples: LeafSamples,
-    lights: wp.array(dtype=wp.uint32),
-    seen: LightLists,
-    discoveries: wp.array(dtype=wp.int32),
-):
+def list_seen_lights(first: wp.int32, samples: LeafSamples, lights: wp.array(dtype=wp.uint32), seen: LightLists):
     leaf = first + wp.tid()
     count = samples.counts[leaf]
     begin = 2 * samples.starts[leaf]
@@ -89,7 +81,6 @@ def list_seen_lights(
         seen.entries[begin + i] = FREE
     looks = wp.min(count, samples.most)
     found = int(0)
-    new = int(0)
     for k in range(looks):
         i = wp.int32(wp.int64(k) * wp.int64(count) / wp.int64(looks))
         word = lights[samples.order[samples.starts[leaf] + i]]
@@ -101,8 +92,6 @@ def list_seen_lights(
             if seen.entries[begin + place] == FREE:
                 seen.entries[begin + place] = entry
                 found += 1
-            if (word & LIGHT_NEW) != wp.uint32(0):
-                new += 1
     listed = int(0)
     for i in range(size * wp.min(found, 1)):
         entry = seen.entries[begin + i]
@@ -111,7 +100,6 @@ def list_seen_lights(
             listed += 1
     sort_entries(seen.entries, begin, found)
     seen.counts[leaf] = found
-    discoveries[leaf] = new
 
 
 # Thread: a leaf. The longest that its joined list can be.
@@ -337,24 +325,65 @@ def fill_buckets(
             tables.chances[start + bucket] = 1.0
 
 
-# Thread: a leaf. Its share of exploration: doubled where something new was found, a quarter less where not. A leaf
-# without samples keeps its share.
+FADING = wp.constant(wp.float32(0.8))  # of what is known, each frame
+
+
+# One of the shares of exploration that are tried.
+@wp.func
+def candidate_exploration(k: wp.int32) -> wp.float32:
+    if k == 0:
+        return 0.05
+    if k == 1:
+        return 0.1
+    if k == 2:
+        return 0.2
+    if k == 3:
+        return 0.4
+    if k == 4:
+        return 0.65
+    return 0.9
+
+
+# Thread: a leaf. Its share of exploration: that with which its light samples would have varied least, as guided_shares
+# explains. It falls where nothing new is found, and rises where the cache cannot hold what there is.
 @wp.kernel
 def adapt_exploration(
     first: wp.int32,
-    settings: CacheSettings,
     samples: LeafSamples,
-    discoveries: wp.array(dtype=wp.int32),
+    records: SampleRecords,
     origins: wp.array(dtype=wp.int32),
-    known: wp.array(dtype=wp.float32),
-    shares: wp.array(dtype=wp.float32),
+    known: CacheTables,
+    tables: CacheTables,
+    first_share: wp.float32,
 ):
     leaf = first + wp.tid()
-    share = settings.exploration
-    if origins[leaf] >= 0:
-        share = known[origins[leaf]]
-        if discoveries[leaf] > 0:
-            share = share * 2.0
-        elif samples.counts[leaf] > 0:
-            share = share * 0.75
-    shares[leaf] = wp.clamp(share, settings.least_exploration, settings.exploration)
+    origin = origins[leaf]
+    moments = ExplorationMoments()
+    share = first_share
+    if origin >= 0:
+        moments = known.moments[origin]
+        share = known.exploration[origin]
+    count = samples.counts[leaf]
+    if count > 0:
+        moments = moments * FADING
+        looks = wp.min(count, samples.most)
+        for k in range(looks):
+            i = wp.int32(wp.int64(k) * wp.int64(count) / wp.int64(looks))
+            slot = samples.order[samples.starts[leaf] + i]
+            if (records.lights[slot] & LIGHT_VISIBLE) != wp.uint32(0):
+                word = records.light_mixtures[slot]
+                square = records.light_values[slot] * records.light_values[slot]
+                # a region that knew nothing could only explore, which says nothing
+                if (word >> wp.uint32(16)) < wp.uint32(65535) and square < wp.inf:
+                    densities = mixture_densities(word)
+                    for c in range(EXPLORATIONS):
+                        a = candidate_exploration(c)
+                        moment = square / wp.max(a * densities[0] + (1.0 - a) * densities[1], 1.0e-6)
+                        moments[c] = moments[c] + moment
+        least = float(wp.inf)
+        for c in range(EXPLORATIONS):
+            if moments[c] > 0.0 and moments[c] < least:
+                least = moments[c]
+                share = candidate_exploration(c)
+    tables.moments[leaf] = moments
+    tables.exploration[leaf] = share

@@ -282,8 +282,9 @@ def hierarchy_choice(tree: LightTree, position: wp.vec3, normal: wp.vec3, u: wp.
     choice.item = -1
     share = tree.directional_probability
     rest = u
+    digits = v  # of u, as far as it is stretched
     if u < share:
-        drawn = alias_choice(tree.directional_alias, tree.directional_count, u / share, v)
+        drawn = alias_choice(tree.directional_alias, tree.directional_count, u / share, v / share)
         choice.item = tree.directional[drawn.item]
         choice.pdf = share * drawn.pdf
         choice.remainder = drawn.remainder
@@ -292,7 +293,8 @@ def hierarchy_choice(tree: LightTree, position: wp.vec3, normal: wp.vec3, u: wp.
         return choice
     if share > 0.0:
         rest = wp.min((u - share) / (1.0 - share), 0.99999994)
-    found = _tree_choice(tree.nodes, position, normal, rest, v)
+        digits = v / (1.0 - share)
+    found = _tree_choice(tree.nodes, position, normal, rest, digits)
     choice.item = wp.cast(found[0], wp.int32)
     choice.pdf = (1.0 - share) * found[1]
     choice.remainder = found[2]

@@ -45,7 +45,7 @@ class Regions(NamedTuple):
     find: wp.Function  # (data, scene, surface, face, u, v) -> region
     slot: wp.Function  # (data, path: int64) -> first slot of its samples, or -1: keep none
     begin: wp.Function  # (data, slot, surface): a sample at a vertex
-    light: wp.Function  # (data, slot, choice, visible)
+    light: wp.Function  # (data, slot, choice, whether it arrives, luminance that it brings to the picture)
     direction: wp.Function  # (data, slot, surface, sample, light of the path so far)
     end: wp.Function  # (data, slot, vertices, light of the path)
 
@@ -151,7 +151,7 @@ def keep_no_vertex(data: NoRegions, slot: wp.int32, s: Surface):
 
 
 @wp.func
-def keep_no_light(data: NoRegions, slot: wp.int32, choice: LightChoice, visible: wp.int32):
+def keep_no_light(data: NoRegions, slot: wp.int32, choice: LightChoice, visible: wp.int32, light: wp.float32):
     pass
 
 

@@ -266,17 +266,19 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
             if wants_emitter:
                 choice = lights.choose(samplers.lights, scene, region, s, wo, u_select)
                 sample = connect_emitter(scene, s, wo, choice, light_2d(index, seed, d + 3, at_first))
-                if slot >= 0:
-                    regions.light(samplers.regions, slot + vertices, choice, sample.arrives)
+                light = wp.vec3(0.0, 0.0, 0.0)
                 if sample.arrives != 0:
                     light = sample.reflected / emitter_share
                     if sample.delta == 0:
                         pdf = directions.pdf(samplers.directions, region, s, sample.direction, sample.bsdf_pdf)
                         light = sample.reflected / (sample.pdf * emitter_share + pdf)
-                    if at_first:
-                        r.emitters = light
-                    else:
-                        r.indirect = r.indirect + wp.cw_mul(throughput, light)
+                if at_first:
+                    r.emitters = light
+                else:
+                    light = wp.cw_mul(throughput, light)
+                    r.indirect = r.indirect + light
+                if slot >= 0:
+                    regions.light(samplers.regions, slot + vertices, choice, sample.arrives, luminance(light))
             if not goes_on:
                 vertices += 1
                 break

@@ -14,11 +14,10 @@ migrations to where it was, and the tree forgot what it had found.)
 
 import warp as wp
 
-from warp_gi.kernels.octahedral import octahedral_decode, octahedral_encode
+from warp_gi.kernels.octahedral import octahedral_encode
 from warp_gi.kernels.quadtree import (
     QUADTREE_LEVELS,
     migrate_block,
-    octahedral_density,
     quadtree_children,
     quadtree_counts,
     quadtree_descend,
@@ -69,9 +68,14 @@ ENOUGH_SAMPLES = wp.constant(256)  # of fewer samples, what was known fades less
 # Density over the unit square of octahedral coordinates, of one over the sphere; see octahedral_density.
 @wp.func
 def square_density(code: wp.uint32, pdf: wp.float32) -> wp.float32:
-    x = wp.float32(code & wp.uint32(0xFFFF)) / 65536.0
-    y = wp.float32(code >> wp.uint32(16)) / 65536.0
-    return pdf / octahedral_density(octahedral_decode(wp.vec2(x, y)))
+    x = wp.abs(wp.float32(code & wp.uint32(0xFFFF)) / 32768.0 - 1.0)
+    z = wp.abs(wp.float32(code >> wp.uint32(16)) / 32768.0 - 1.0)
+    y = 1.0 - x - z
+    if y < 0.0:  # folded out; the signs do not matter
+        x += y
+        z += y
+    square = x * x + y * y + z * z
+    return 4.0 * pdf / (square * wp.sqrt(square))
 
 
 # Sums squared contributions over quadrants of quadtree leaves; returns whether there was any sample.

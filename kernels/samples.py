@@ -18,11 +18,25 @@ from warp_gi.kernels.types import SceneData
 wp.set_module_options({"enable_backward": False})
 
 LIGHT_VISIBLE = wp.constant(wp.uint32(1 << 31))
-LIGHT_NEW = wp.constant(wp.uint32(1 << 30))  # selected by exploration, and unknown to the region
 SURFACE_GLOSSY = wp.constant(wp.uint32(1 << 29))
 LIGHT_ITEM = wp.constant(wp.uint32((1 << 28) - 1))  # emitter + 1; 0: none was sampled
 GLOSSY_ALPHA = wp.constant(wp.float32(0.2))  # GGX alpha below which a surface counts as glossy
 NO_DIRECTION = wp.constant(wp.float32(-1.0))
+
+
+# Share of one of two strategies in the density of a sample, and the share with which it is asked, 16 bits each.
+@wp.func
+def pack_mixture(posterior: wp.float32, share: wp.float32) -> wp.uint32:
+    low = wp.uint32(wp.clamp(posterior, 0.0, 1.0) * 65535.0 + 0.5)
+    return low | (wp.uint32(share * 65535.0 + 0.5) << wp.uint32(16))
+
+
+# (density of that strategy, density of the other), each over that of the mixture.
+@wp.func
+def mixture_densities(word: wp.uint32) -> wp.vec2:
+    share = wp.clamp(wp.float32(word >> wp.uint32(16)), 1.0, 65534.0) / 65535.0
+    posterior = wp.float32(word & wp.uint32(0xFFFF)) / 65535.0
+    return wp.vec2(posterior / share, (1.0 - posterior) / (1.0 - share))
 
 
 # Samples by slot.
@@ -30,10 +44,12 @@ NO_DIRECTION = wp.constant(wp.float32(-1.0))
 class SampleRecords:
     codes: wp.array(dtype=wp.uint32)  # octree cell of the point; EMPTY_CODE: no sample
     lights: wp.array(dtype=wp.uint32)  # LIGHT_*
+    light_values: wp.array(dtype=wp.float32)  # luminance that the light sample brought to the picture
+    light_mixtures: wp.array(dtype=wp.uint32)  # pack_mixture of exploring
     directions: wp.array(dtype=wp.uint32)  # quadtree_pack_direction
     contributions: wp.array(dtype=wp.float32)  # luminance that came to the picture that way, but for emitters it hit
     pdfs: wp.array(dtype=wp.float32)  # 1/sr, of the direction
-    mixtures: wp.array(dtype=wp.uint32)  # share of the BSDF in the density there (16 bits), and of asking it (<< 16)
+    mixtures: wp.array(dtype=wp.uint32)  # pack_mixture of the BSDF
     vertices: wp.int32  # slots of a path
     stride: wp.int32
     seed: wp.uint32
@@ -77,22 +93,21 @@ def keep_vertex(data: SampleRegions, slot: wp.int32, s: Surface):
 
 
 @wp.func
-def keep_light(data: SampleRegions, slot: wp.int32, choice: LightChoice, visible: wp.int32):
+def keep_light(data: SampleRegions, slot: wp.int32, choice: LightChoice, visible: wp.int32, light: wp.float32):
     word = data.records.lights[slot] | wp.uint32(choice.item + 1)
     if visible != 0:
         word = word | LIGHT_VISIBLE
-    if choice.is_new != 0:
-        word = word | LIGHT_NEW
     data.records.lights[slot] = word
+    data.records.light_values[slot] = light
+    data.records.light_mixtures[slot] = pack_mixture(choice.by_exploring, choice.explores)
 
 
 # `light` is what the path had gathered before; `keep_end` makes a difference of it.
 @wp.func
 def keep_direction(data: SampleRegions, slot: wp.int32, s: Surface, sample: DirectionSample, light: wp.float32):
     data.records.directions[slot] = quadtree_pack_direction(sample.wi)
-    posterior = wp.clamp(sample.bsdf_share * sample.bsdf_pdf / sample.pdf, 0.0, 1.0)
-    share = wp.uint32(sample.bsdf_share * 65535.0 + 0.5)
-    data.records.mixtures[slot] = wp.uint32(posterior * 65535.0 + 0.5) | (share << wp.uint32(16))
+    posterior = sample.bsdf_share * sample.bsdf_pdf / sample.pdf
+    data.records.mixtures[slot] = pack_mixture(posterior, sample.bsdf_share)
     data.records.contributions[slot] = light
     data.records.pdfs[slot] = sample.pdf
 

@@ -27,18 +27,21 @@ from warp_gi.kernels import (
     surface,
     types,
 )
-from warp_gi.kernels.emitters import punctual_light
+from warp_gi.kernels.emitters import LightChoice, punctual_light
 from warp_gi.launch import copied, launch, set_threads
 from warp_gi.techniques.light_tree import EmitterBounds, build_tree, to_device
 from warp_gi.techniques.ltc import ltc_table
-from warp_gi.techniques.visibility_light_cache import EXPLORES_BY, CacheState
+from warp_gi.techniques.visibility_light_cache import EXPLORES_BY, MOVING_EXPLORATION, CacheState
 
 wp.set_module_options({"enable_backward": False})
 
-VISIBLE, NEW, GLOSSY = 1 << 31, 1 << 30, 1 << 29
+VISIBLE, GLOSSY = 1 << 31, 1 << 29
 MOST_LISTED = 1024
 MOST_BUCKETS = 64  # beside the first
 LEAST_CHANCE = 0.05
+EXPLORATIONS = np.array([0.05, 0.1, 0.2, 0.4, 0.65, 0.9])
+FADING = 0.8
+KNEW_NOTHING = 65535  # share of a region that explores only, in 16 bits
 MAIN, LEFT_OUT = -1.0, -1.0
 ROUNDING = 2e-3, 1.5e-5  # of a weight: relative, and times the light's luminance
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -80,7 +83,7 @@ def choose_lights(
     numbers: wp.array(dtype=wp.vec2),
     items: wp.array2d(dtype=wp.int32),
     pdfs: wp.array2d(dtype=wp.float32),
-    is_new: wp.array2d(dtype=wp.int32),
+    mixtures: wp.array2d(dtype=wp.vec2),
 ):
     item = first + wp.tid()
     i = item / items.shape[1]
@@ -90,7 +93,25 @@ def choose_lights(
     choice = light_cache.cached_light(cache, scene, spots.regions[i], s, wo, numbers[k])
     items[i, k] = choice.item
     pdfs[i, k] = choice.pdf
-    is_new[i, k] = choice.is_new
+    mixtures[i, k] = wp.vec2(choice.by_exploring, choice.explores)
+
+
+# Thread: a slot. Keeps a light sample as paths do.
+@wp.kernel
+def keep_lights(
+    first: wp.int32,
+    regions: samples.SampleRegions,
+    items: wp.array(dtype=wp.int32),
+    mixtures: wp.array(dtype=wp.vec2),
+    visible: wp.array(dtype=wp.int32),
+    values: wp.array(dtype=wp.float32),
+):
+    slot = first + wp.tid()
+    choice = LightChoice()
+    choice.item = items[slot]
+    choice.by_exploring = mixtures[slot][0]
+    choice.explores = mixtures[slot][1]
+    samples.keep_light(regions, slot, choice, visible[slot], values[slot])
 
 
 # The hierarchy's probability of each light.
@@ -275,6 +296,7 @@ def lit_scene():
 def preprocessed(scene, estimator=None, state=None, time=0.0, position=(0.0, 1.0, 0.0)):
     """Return a frame without pixels as ``preprocess`` leaves it, and the state."""
     estimator = estimator or gi.VisibilityLightCache()
+    state = state or estimator.start(scene, str(device()), None)
     scene.update(time, time, device())
     data = copied(scene.data(device()), types.SceneData)
     data.emitters = copied(data.emitters, types.Emitters)
@@ -285,7 +307,6 @@ def preprocessed(scene, estimator=None, state=None, time=0.0, position=(0.0, 1.0
         camera=SimpleNamespace(position=position),
         launch=lambda kernel, inputs, count: launch(kernel, count, inputs, device()),
     )
-    state = state or estimator.start(scene, str(device()), None)
     return frame, estimator.preprocess(frame, state)
 
 
@@ -406,10 +427,10 @@ def expected_probabilities(frame, data, spots):
 
 def choices(frame, data, spots, numbers):
     shape = spots.faces.shape[0], len(numbers)
-    items, pdfs, new = (wp.empty(shape, dtype=t, device=device()) for t in (wp.int32, wp.float32, wp.int32))
-    inputs = [data, frame.data, spots, array(numbers, wp.vec2), items, pdfs, new]
+    items, pdfs, mixtures = (wp.empty(shape, dtype=t, device=device()) for t in (wp.int32, wp.float32, wp.vec2))
+    inputs = [data, frame.data, spots, array(numbers, wp.vec2), items, pdfs, mixtures]
     launch(choose_lights, items.size, inputs, device())
-    return items.numpy(), pdfs.numpy(), new.numpy()
+    return items.numpy(), pdfs.numpy(), mixtures.numpy()
 
 
 # ---- probabilities ----
@@ -480,11 +501,12 @@ def test_choices_follow_the_probabilities(kind, explores_by):
     rng = np.random.default_rng(2)
     numbers = (rng.integers(0, 1 << 24, (10_000, 2)) / (1 << 24)).astype(np.float32)
     numbers[:3] = [(0.0, 0.0), (1 - 2**-24, 1 - 2**-24), (1 - 2**-24, 0.0)]
-    items, chosen, new = choices(frame, data, spots, numbers)
+    items, chosen, mixtures = choices(frame, data, spots, numbers)
     assert items.min() >= -1 and items.max() < 203
     rows = np.arange(len(items))[:, None]
     assert np.allclose(chosen, np.where(items >= 0, pdfs[rows, items], 0.0), rtol=1e-5)
-    contents = contents_of(data.tables)
+    buckets, shares = data.tables.buckets.numpy(), data.tables.exploration.numpy().astype(np.float64)
+    explores = explored(frame, data, spots)
     nothing = np.zeros(len(items), bool)
     for row, region in enumerate(spots.regions.numpy()):
         found = items[row][items[row] >= 0]
@@ -492,8 +514,13 @@ def test_choices_follow_the_probabilities(kind, explores_by):
         total = len(numbers) if nothing[row] else None
         p = chi_squared(np.bincount(found, minlength=203), pdfs[row] * len(numbers), total)
         assert p > 1e-5, (region, PLACES[row % len(PLACES)])
-        unknown = ~np.isin(items[row], [e for held in contents[region][0] for e in held])
-        assert np.array_equal(new[row] != 0, unknown)
+        share = shares[region] if buckets[region] else 1.0
+        by_exploring = share * explores[row] / pdfs[row].clip(1e-30)
+        assert (mixtures[row, :, 1] == np.float32(share)).all()
+        assert np.allclose(mixtures[row, :, 0], np.where(items[row] >= 0, by_exploring[items[row]], 0.0), rtol=2e-4)
+        # of all samples, as many explored as they say
+        wrong = abs((numbers[:, 0] < share).mean() - mixtures[row, :, 0].mean() - (items[row] < 0).mean())
+        assert wrong < 5 * np.sqrt(share / len(numbers)) + 1e-6
     sums = pdfs.sum(axis=1)
     assert (sums[nothing] < 0.9999).all() and (explores_by == "hierarchy") == nothing.any()
 
@@ -708,15 +735,30 @@ def test_exploration_goes_after_lights_that_move():
     frame, state = preprocessed(scene, estimator)
     before = explored_by_table(frame)
     state.tables.exploration.fill_(0.03)
+    state.tables.moments.fill_(7.0)
     frame, state = preprocessed(scene, estimator, state, 0.5)
     assert explored_by_table(frame)[:2].sum() > 0.98 > before[:2].sum()
-    assert np.allclose(state.tables.exploration.numpy(), 0.2), "what is known is in doubt"
+    assert np.allclose(state.tables.exploration.numpy(), MOVING_EXPLORATION), "what is known is in doubt"
+    assert MOVING_EXPLORATION == 0.3 and (state.tables.moments.numpy() == 0).all()
     state.tables.exploration.fill_(0.03)
+    state.tables.moments.fill_(7.0)
     frame, state = preprocessed(scene, estimator, state, 0.5)  # now it stands still
     assert np.allclose(explored_by_table(frame), before)
-    assert np.allclose(state.tables.exploration.numpy(), 0.03)
+    assert np.allclose(state.tables.exploration.numpy(), 0.03) and (state.tables.moments.numpy() == 7).all()
     shapes = state.shapes.numpy()
     assert np.allclose(shapes["p0"][0], (-0.5, 2, 0), atol=1e-5)
+
+
+@pytest.mark.parametrize(("settings", "expected"), [({"exploration": 0.6}, 0.6), ({"adapts_exploration": False}, 0.03)])
+def test_lights_that_move_do_not_lower_exploration(settings, expected):
+    """Nor do they change a share that is for the caller to choose."""
+    scene, estimator = moving_scene(), gi.VisibilityLightCache(**settings)
+    _, state = preprocessed(scene, estimator)
+    state.tables.exploration.fill_(0.03)
+    given = state.tables
+    _, state = preprocessed(scene, estimator, state, 0.5)
+    assert np.allclose(state.tables.exploration.numpy(), expected)
+    assert np.allclose(given.exploration.numpy(), 0.03), "the state before is another's"
 
 
 def test_the_hierarchy_follows_lights_that_move():
@@ -735,7 +777,7 @@ def test_the_hierarchy_follows_lights_that_move():
     state.tables.exploration.fill_(0.03)
     frame, state = preprocessed(scene, estimator, state, 0.5)
     after = chances(frame)
-    assert np.allclose(state.tables.exploration.numpy(), 0.2), "what is known is in doubt"
+    assert np.allclose(state.tables.exploration.numpy(), MOVING_EXPLORATION), "what is known is in doubt"
     fresh, _ = preprocessed(scene, estimator, None, 0.5)
     assert np.allclose(after, chances(fresh), rtol=1e-3) and not np.allclose(after, before, rtol=5e-3)
     state.tables.exploration.fill_(0.03)
@@ -777,9 +819,9 @@ def entries_of(found):
     return [entries[begin : begin + count].tolist() for begin, count in zip(offsets, counts, strict=True)]
 
 
-def words(emitters, visible, new, rng):
+def words(emitters, visible, rng):
     """What samples remember of lights; -1: none was sampled."""
-    value = (np.asarray(emitters) + 1) | np.where(visible, VISIBLE, 0) | np.where(new, NEW, 0)
+    value = (np.asarray(emitters) + 1) | np.where(visible, VISIBLE, 0)
     return value | np.where(rng.random(len(value)) < 0.3, GLOSSY, 0)
 
 
@@ -793,10 +835,9 @@ def leaf_samples(counts, order, most):
 def listed(grouped, word):
     seen = lists([[]] * grouped.counts.shape[0])
     seen.entries = wp.empty(2 * grouped.order.shape[0], dtype=wp.int32, device=device())
-    discoveries = wp.empty(grouped.counts.shape[0], dtype=wp.int32, device=device())
-    inputs = [grouped, array(word, wp.uint32), seen, discoveries]
+    inputs = [grouped, array(word, wp.uint32), seen]
     launch(light_cache_build.list_seen_lights, grouped.counts.shape[0], inputs, device(), 16)
-    return entries_of(seen), discoveries.numpy().tolist()
+    return entries_of(seen)
 
 
 @pytest.mark.parametrize("most", [1, 7, 1000, 1 << 20])
@@ -809,22 +850,20 @@ def test_lists_hold_the_lights_that_samples_saw(most):
     emitters[2:3] = (1 << 23) - 1
     visible = (rng.random(total) < 0.5) & (emitters >= 0)
     visible[[0, 2]] = True
-    word = words(emitters, visible, rng.random(total) < 0.1, rng)
+    word = words(emitters, visible, rng)
     order = rng.permutation(total)
     slots = np.empty(total, np.int64)
     slots[order] = word
-    found, discoveries = listed(leaf_samples(counts, order, most), slots)
+    found = listed(leaf_samples(counts, order, most), slots)
     end = np.cumsum(counts)
     for leaf, count in enumerate(counts):
         looks = min(count, most)
-        lights, new = set(), 0
+        lights = set()
         for k in range(looks):
             w = int(word[end[leaf] - count + k * count // looks])
             if w & VISIBLE and len(lights) < MOST_LISTED:
                 lights.add((w & ((1 << 28) - 1)) - 1)
-                new += w & NEW != 0
         assert found[leaf] == [e << 8 for e in sorted(lights)]
-        assert discoveries[leaf] == new
     assert most < 1 << 20 or len(found[10]) == MOST_LISTED
 
 
@@ -832,7 +871,7 @@ def test_looks_are_spread():
     """Every sample saw another light, so the list says which were looked at."""
     rng = np.random.default_rng(1)
     count, most = 1000, 300
-    found, _ = listed(leaf_samples([count], np.arange(count), most), words(np.arange(count), True, False, rng))
+    found = listed(leaf_samples([count], np.arange(count), most), words(np.arange(count), True, rng))
     looked = np.array(found[0]) >> 8
     assert len(looked) == most and set(np.diff(looked)) == {3, 4} and looked[0] < 4 and looked[-1] >= count - 4
 
@@ -843,8 +882,16 @@ def test_hash_collisions():
     emitters = np.arange(1 << 22)
     hashes = (((emitters << 8) * 0x9E3779B1) & 0xFFFFFFFF) >> 12
     same = emitters[(hashes & 1023) == 1023][:900]
-    found, _ = listed(leaf_samples([900], np.arange(900), 900), words(same, True, False, rng))
+    found = listed(leaf_samples([900], np.arange(900), 900), words(same, True, rng))
     assert found[0] == [e << 8 for e in same]
+
+
+def light_samples(rng, count):
+    """What light samples brought, and the shares of exploring in their densities and of samples."""
+    values = 10 ** rng.uniform(-2, 1, count) * (rng.random(count) < 0.9)
+    shares = rng.choice([0.02, 0.1, 0.4, 0.9, 1.0], count)
+    posteriors = np.where(rng.random(count) < 0.3, rng.choice([0.0, 1.0], count), rng.random(count))
+    return values, np.rint(posteriors * 65535).astype(np.int64) | np.rint(shares * 65535).astype(np.int64) << 16
 
 
 def deep_lesson(seed=3, count=20_000, lights=203):
@@ -855,11 +902,13 @@ def deep_lesson(seed=3, count=20_000, lights=203):
     records = samples.SampleRecords()
     codes = (1 << 29) + (np.abs(rng.normal(size=count)) * 2.0 ** rng.integers(5, 26, count)).astype(np.int64)
     emitters = (rng.integers(0, 20, count) + codes // (1 << 20)) % lights
-    word = words(emitters, rng.random(count) < 0.7, rng.random(count) < 0.01, rng)
+    word = words(emitters, rng.random(count) < 0.7, rng)
     records.codes, records.lights = array(codes, wp.uint32), array(word, wp.uint32)
     for name in ("directions", "mixtures"):
         setattr(records, name, wp.zeros(count, dtype=wp.uint32, device=device()))
     records.contributions = wp.zeros(count, dtype=wp.float32, device=device())
+    values, mixtures = light_samples(rng, count)
+    records.light_values, records.light_mixtures = array(values, wp.float32), array(mixtures, wp.uint32)
     return settings, settings.learn(state, records, device())
 
 
@@ -872,9 +921,8 @@ def test_leaves_do_not_disturb_each_other():
     for order in (range(lesson.octree.leaf_count), reversed(range(lesson.octree.leaf_count))):
         seen = lists([[]] * lesson.octree.leaf_count)
         seen.entries = wp.zeros(2 * grouped.order.shape[0], dtype=wp.int32, device=device())
-        discoveries = wp.empty(lesson.octree.leaf_count, dtype=wp.int32, device=device())
         for leaf in order:
-            inputs = [leaf, grouped, lesson.records.lights, seen, discoveries]
+            inputs = [leaf, grouped, lesson.records.lights, seen]
             wp.launch(light_cache_build.list_seen_lights, dim=1, inputs=inputs, device=device(), record_tape=False)
         found = entries_of(seen)
         results.append([found[leaf] for leaf in leaves])
@@ -1027,10 +1075,9 @@ def test_lights_that_matter_most(capacity):
 # ---- buckets ----
 
 
-def settings_of(capacity=32, memory=4, hysteresis=0.75, exploration=0.1, least=0.02):
+def settings_of(capacity=32, memory=4, hysteresis=0.75):
     s = light_cache_build.CacheSettings()
     s.capacity, s.memory, s.hysteresis = capacity, memory, hysteresis
-    s.exploration, s.least_exploration = exploration, least
     return s
 
 
@@ -1148,25 +1195,165 @@ def test_buckets_that_overflow_leave_lights_to_exploration(explores_by):
 # ---- exploration that adapts ----
 
 
-def test_exploration_adapts():
-    """Twice as much where something was found, a quarter less where not, as it was without samples, in its bounds."""
-    cases = [  # samples, discoveries, origin, share before, expected
-        (10, 1, 1, 0.03, 0.06),
-        (10, 9, 1, 0.04, 0.08),
-        (10, 1, 1, 0.08, 0.1),
-        (10, 0, 1, 0.08, 0.06),
-        (10, 0, 1, 0.022, 0.02),
-        (0, 0, 1, 0.07, 0.07),
-        (0, 0, -1, 0.07, 0.1),
-        (5, 2, -1, 0.03, 0.1),
-    ]
-    for count, found, origin, before, expected in cases:
-        shares = wp.empty(1, dtype=wp.float32, device=device())
-        known = array([0.05, before], wp.float32)
-        grouped = leaf_samples([count], np.arange(count), 100)
-        inputs = [settings_of(), grouped, array([found]), array([origin]), known, shares]
-        launch(light_cache_build.adapt_exploration, 1, inputs, device())
-        assert np.isclose(shares.numpy()[0], expected)
+def exploration_tables(moments, shares):
+    tables = light_cache.CacheTables()
+    tables.moments = array(moments, light_cache.ExplorationMoments)
+    tables.exploration = array(shares, wp.float32)
+    return tables
+
+
+def records_of(lights, values, mixtures):
+    records = samples.SampleRecords()
+    records.lights, records.light_values = array(lights, wp.uint32), array(values, wp.float32)
+    records.light_mixtures = array(mixtures, wp.uint32)
+    return records
+
+
+def adapted(grouped, records, origins, known, first_share):
+    """Return the moments and the shares of every leaf."""
+    leaves = len(origins)
+    tables = exploration_tables(np.full((leaves, 6), -7.0), np.full(leaves, -7.0))
+    inputs = [grouped, records, array(origins), known, tables, first_share]
+    launch(light_cache_build.adapt_exploration, leaves, inputs, device(), 16)
+    return tables.moments.numpy(), tables.exploration.numpy()
+
+
+def expected_exploration(grouped, records, origins, known, first_share):
+    """Float64 moments, and which shares may be chosen: those whose moments are the least but for rounding."""
+    lights, values, mixtures = (getattr(records, n).numpy() for n in ("lights", "light_values", "light_mixtures"))
+    starts, counts, order = (getattr(grouped, n).numpy().astype(np.int64) for n in ("starts", "counts", "order"))
+    moments, shares = np.zeros((len(origins), 6)), []
+    for leaf, origin in enumerate(origins):
+        last = [first_share]
+        if origin >= 0:
+            moments[leaf], last = known.moments.numpy()[origin], [known.exploration.numpy()[origin]]
+        looks = min(counts[leaf], grouped.most)
+        if looks > 0:
+            slots = order[starts[leaf] + np.arange(looks) * counts[leaf] // looks]
+            slots = slots[(lights[slots] >= VISIBLE) & (mixtures[slots] >> 16 < KNEW_NOTHING)]
+            share = (mixtures[slots] >> 16).clip(1, 65534)[:, None] / 65535
+            posterior = (mixtures[slots] & 65535)[:, None] / 65535
+            # of the density that the sample had, what the mixture with another share has
+            ratios = EXPLORATIONS * posterior / share + (1 - EXPLORATIONS) * (1 - posterior) / (1 - share)
+            squares = values[slots, None].astype(np.float64) ** 2
+            moments[leaf] = FADING * moments[leaf] + (squares / ratios.clip(1e-6)).sum(axis=0)
+            if moments[leaf].max() > 0:
+                last = EXPLORATIONS[moments[leaf] <= moments[leaf].min() * (1 + 1e-4)]
+        shares.append(last)
+    return moments, shares
+
+
+def check_exploration(found, expected):
+    assert np.allclose(found[0], expected[0], rtol=1e-4, atol=0)
+    for leaf, (share, possible) in enumerate(zip(found[1], expected[1], strict=True)):
+        assert np.isclose(share, possible, rtol=1e-6).any(), (leaf, share, possible)
+
+
+@pytest.mark.parametrize("most", [1, 30, 1 << 20])
+def test_exploration_with_the_least_second_moment(most):
+    """Over frames, in each of which leaves have other samples and take over what other leaves knew."""
+    rng = np.random.default_rng(most)
+    chosen, known = [], exploration_tables(np.zeros((40, 6)), rng.uniform(0.1, 0.9, 40))
+    for leaves in (60, 30, 50):
+        counts = rng.choice([0, 1, 2, 40, 300], leaves)
+        counts[:2] = 0
+        total = counts.sum()
+        lights = words(rng.integers(-1, 40, total), rng.random(total) < 0.7, rng)
+        records = records_of(lights, *light_samples(rng, total))
+        grouped = leaf_samples(counts, rng.permutation(total), most)
+        origins = rng.integers(0, known.exploration.shape[0], leaves)
+        origins[rng.random(leaves) < 0.2] = -1
+        origins[:2] = -1, 7
+        expected = expected_exploration(grouped, records, origins, known, 0.15)
+        found = adapted(grouped, records, origins, known, 0.15)
+        check_exploration(found, expected)
+        none = counts == 0
+        old = none & (origins >= 0)
+        assert old.any() and (none & ~old).any()
+        assert np.array_equal(found[0][old], known.moments.numpy()[origins[old]])
+        assert np.array_equal(found[1][old], known.exploration.numpy()[origins[old]])
+        assert (found[1][none & ~old] == np.float32(0.15)).all() and (found[0][none & ~old] == 0).all()
+        chosen += found[1][~none].tolist()
+        known = exploration_tables(*found)
+    found = set(np.float32(chosen))  # one sample wants as much or as little as there is
+    assert set(np.float32(EXPLORATIONS if most > 1 else EXPLORATIONS[[0, -1]])) <= found
+
+
+@pytest.mark.parametrize(
+    ("light", "value", "mixture"),
+    [(VISIBLE | 5, 3.0, KNEW_NOTHING << 16 | 65535), (5, 3.0, 6554 << 16 | 65535), (VISIBLE | 5, 0.0, 6554 << 16 | 9)],
+    ids=["of regions that knew nothing", "that did not arrive", "that brought nothing"],
+)
+def test_samples_that_say_nothing_of_exploration(light, value, mixture):
+    """What was known fades all the same, and the share stays; the first one, where nothing was."""
+    known = exploration_tables([[0.0] * 6, [9.0, 8.0, 7.0, 2.0, 3.0, 4.0]], [0.33, 0.4])
+    records = records_of([light] * 15, [value] * 15, [mixture] * 15)
+    moments, shares = adapted(leaf_samples([5, 5, 5], range(15), 9), records, np.array([0, 1, -1]), known, 0.15)
+    assert np.allclose(shares, [0.33, 0.4, 0.15])
+    assert np.allclose(moments, [[0.0] * 6, np.multiply(FADING, [9, 8, 7, 2, 3, 4]), [0.0] * 6])
+
+
+def test_kept_lights():
+    """Emitter, whether it was seen, what it brought, and how it came about, of samples as paths keep them."""
+    rng = np.random.default_rng(3)
+    count = 1000
+    items, visible = rng.integers(-1, 1 << 23, count), rng.integers(0, 2, count)
+    mixtures, values = rng.random((count, 2)), rng.random(count)
+    items[:2], mixtures[:4] = [-1, (1 << 23) - 1], [(0, 0), (1, 1), (1.0001, 1), (0.5, 1 - 2**-24)]
+    regions = samples.SampleRegions()
+    regions.records = records_of(np.where(rng.random(count) < 0.3, GLOSSY, 0), np.zeros(count), np.zeros(count))
+    before = regions.records.lights.numpy().copy()
+    given = [array(items), array(mixtures, wp.vec2), array(visible), array(values, wp.float32)]
+    launch(keep_lights, count, [regions, *given], device())
+    found = regions.records
+    assert np.array_equal(found.lights.numpy(), before | (items + 1) | np.where(visible, VISIBLE, 0))
+    assert np.array_equal(found.light_values.numpy(), np.float32(values))
+    word, most = found.light_mixtures.numpy(), 1 / 65535
+    assert np.abs((word & 65535) * most - mixtures[:, 0].clip(0, 1)).max() < 0.51 * most
+    assert np.abs((word >> 16) * most - mixtures[:, 1]).max() < 0.51 * most
+    assert word[1] >> 16 == KNEW_NOTHING and word[0] == 0
+
+
+def learnt_exploration(contents, unseen=(), frames=4):
+    """Return each PLACE's share after some frames in a region of ``contents``, all of whose lights but some arrive."""
+    frame, data, _ = lit_cache("table")
+    rng = np.random.default_rng(7)
+    places = len(PLACES)
+    spots = spots_in([0])
+    spots.regions = array(np.arange(places))
+    light = asked(weigh_lights, data, frame, spots)
+    light[:, list(unseen)] = 0.0
+    shares, known = np.full(places, 0.1), exploration_tables(np.zeros((places, 6)), np.full(places, 0.1))
+    for _ in range(frames):
+        data.tables = table([(*contents, share) for share in shares.tolist()])
+        items, pdfs, mixtures = choices(frame, data, spots, rng.random((4000, 2)).astype(np.float32))
+        values = light[np.arange(places)[:, None], items] / pdfs
+        regions = samples.SampleRegions()
+        regions.records = records_of(np.zeros(items.size), np.zeros(items.size), np.zeros(items.size))
+        given = [array(items.ravel()), array(mixtures.reshape(-1, 2), wp.vec2), array((values > 0).ravel())]
+        launch(keep_lights, items.size, [regions, *given, array(values.ravel(), wp.float32)], device())
+        grouped = leaf_samples(np.full(places, 4000), np.arange(items.size), 1 << 20)
+        moments, shares = adapted(grouped, regions.records, np.arange(places), known, 0.1)
+        known = exploration_tables(moments, shares)
+    return shares[light.sum(axis=1) > 0], light
+
+
+def test_exploration_falls_where_the_cache_holds_all_that_matters():
+    """One bucket, weighed for the very point; nothing arrives of the many lights that it does not know."""
+    known = [*range(0, 200, 7), 200, 201, 202]
+    hidden = np.setdiff1d(np.arange(203), known)
+    shares, light = learnt_exploration((known, [], 0), hidden)
+    assert len(shares) > 6 and (light > 0).sum(axis=1).max() > 12
+    assert np.allclose(shares, 0.05), shares
+
+
+def test_exploration_rises_where_the_cache_cannot_hold_what_matters():
+    """It knows a few of many lights."""
+    shares, _ = learnt_exploration(([40, 41], [], 0))
+    assert len(shares) > 6 and (shares >= 0.65).mean() > 0.7, shares
+    # and a few hidden ones that it takes to be there
+    shares, _ = learnt_exploration((range(0, 20), [], 0), range(0, 20))
+    assert np.allclose(shares, 0.9), shares
 
 
 # ---- all of it ----
@@ -1187,7 +1374,7 @@ def test_a_region_knows_what_it_and_its_neighbours_saw():
             w = word[order[starts[leaf] : starts[leaf] + counts[leaf]]]
             seen[leaf] = [int(e) << 8 for e in np.unique((w[w >= VISIBLE] & ((1 << 28) - 1)).astype(int) - 1)]
         before = state.tables.buckets.numpy()
-        shares = state.tables.exploration.numpy()
+        shares = expected_exploration(lesson.leaf_samples(2048), lesson.records, origins, state.tables, 0.1)
         state = estimator.learn(lesson, state)
         expected = expected_join(seen, known, neighbours, origins, 1)
         assert entries_of(state.known) == expected
@@ -1201,9 +1388,8 @@ def test_a_region_knows_what_it_and_its_neighbours_saw():
             assert np.allclose(found[1], chances, atol=2e-6)
             buckets.append(len(held))
         assert max(buckets) > 3 and min(buckets) == 0
-        now = state.tables.exploration.numpy()
-        kept = (origins >= 0) & (counts == 0)
-        assert kept.any() and np.allclose(now[kept], shares[origins[kept]])
+        assert ((origins >= 0) & (counts == 0)).any()
+        check_exploration([x.numpy() for x in (state.tables.moments, state.tables.exploration)], shares)
         known = expected
         _, other = deep_lesson(11 + turn, 20_000 // (turn + 1))
         lesson = settings.learn(lesson.octree, other.records, device())
@@ -1221,6 +1407,14 @@ def test_learning_without_samples():
     assert {e & 255 for x in entries_of(after.known) for e in x} == {1}
 
 
+def test_exploration_that_does_not_adapt():
+    estimator = gi.VisibilityLightCache(exploration=0.7, adapts_exploration=False)
+    _, state = preprocessed(lit_scene(), estimator)
+    for seed in (1, 2):
+        state = estimator.learn(deep_lesson(seed)[1], state)
+    assert (state.tables.exploration.numpy() == np.float32(0.7)).all() and state.tables.buckets.numpy().max() > 1
+
+
 def test_threads_do_not_matter():
     results = []
     try:
@@ -1232,7 +1426,7 @@ def test_threads_do_not_matter():
                 state = estimator.learn(deep_lesson(seed)[1], state)
             t = state.tables
             used = [(held, chances.tolist()) for held, chances in contents_of(t)]
-            results.append((used, *(x.numpy().tolist() for x in (t.buckets, t.offsets, t.exploration))))
+            results.append((used, *(x.numpy().tolist() for x in (t.buckets, t.offsets, t.exploration, t.moments))))
     finally:
         set_threads(None)
     assert results[0] == results[1]
@@ -1244,10 +1438,9 @@ def test_threads_do_not_matter():
         ({"capacity": 0}, "capacity"),
         ({"capacity": 33}, "capacity"),
         ({"exploration": 0.0}, "exploration"),
-        ({"exploration": 1.1}, "exploration"),
+        ({"exploration": 1.0}, "exploration"),
+        ({"exploration": -0.1}, "exploration"),
         ({"exploration": float("nan")}, "exploration"),
-        ({"least_exploration": 0.0}, "least_exploration"),
-        ({"least_exploration": 0.2}, "least_exploration"),
         ({"explores_by": "power"}, "way to explore"),
         ({"memory": -1}, "memory"),
         ({"memory": 201}, "memory"),
@@ -1333,10 +1526,52 @@ def test_scene_without_lights():
         assert np.allclose(frame.numpy("beauty"), 0.5, rtol=1e-4)
 
 
+class WatchedCache(gi.VisibilityLightCache):
+    """Remembers what it learnt from, and what the samples were taken by."""
+
+    def learn(self, lesson, state):
+        """As the other does."""
+        values = [getattr(lesson.records, n).numpy() for n in ("codes", "lights", "light_values", "light_mixtures")]
+        watched.append((values, state.tables.exploration.numpy()))
+        return super().learn(lesson, state)
+
+
+watched = []
+
+
+def test_samples_remember_what_they_brought_to_the_picture():
+    """Where lights have no size, that is all the light that there is, at whichever vertex of a path."""
+    grey = gi.Material("grey", (0.7, 0.6, 0.5), specular=0.0)
+    walls = [quad((-2, 0, -2), (0, 0, 4), (4, 0, 0), grey), quad((-2, 0, -2), (4, 0, 0), (0, 3, 0), grey)]
+    lights = [gi.PunctualLight("point", (0.5 + k, 1.0, 0.7), position=(k - 1.5, 1.0, 0.5)) for k in range(4)]
+    scene = gi.Scene([gi.Node("walls", walls)], lights)
+    camera = gi.CameraPath.still(gi.Camera.look_at((0, 1.5, 3.0), (0, 0.8, -1), hfov=50, resolution=SIZE))
+    pipeline = gi.Pipeline(
+        environment=None, emitters=WatchedCache(), indirect=gi.BsdfPaths(max_depth=3), spp=4, octree=gi.SampleOctree()
+    )
+    watched.clear()
+    shares = set()
+    for frame in gi.render(scene, camera, pipeline, frames=range(3), device=str(device())):
+        emitters, indirect = (frame.numpy(x).astype(np.float64) for x in ("emitters", "indirect"))
+        (codes, words_kept, values, mixtures), exploration = watched[-1]
+        there = (codes != 0xFFFFFFFF) & ((words_kept & ((1 << 28) - 1)) > 0)
+        seen = words_kept[there] >= VISIBLE
+        assert (values[there][seen] > 0).all() and (values[there][~seen] == 0).all() and 0 < seen.mean()
+        assert indirect.sum() > 0.03 * emitters.sum()
+        assert np.isclose(values[there].sum() / 4, ((emitters + indirect) @ LUMINANCE).sum(), rtol=1e-3)
+        kept = set((mixtures[there] >> 16).tolist())
+        assert kept <= {KNEW_NOTHING, *np.rint(exploration * 65535.0).astype(int).tolist()}
+        shares |= kept
+    assert len(watched) == 3 and KNEW_NOTHING in shares and len(shares) > 1
+
+
 @cache
-def by_power(moves, name):
-    """The reference on the device of that name."""
-    return rendered(divided_room(moves), gi.PowerLights(), range(100, 196), (0, 5))
+def by_hierarchy(moves, name):
+    """The reference on the device of that name. Nothing has moved in the first frame."""
+    if not moves:
+        return rendered(divided_room(), gi.LightHierarchy(), range(100, 196), (0, 5))
+    sixth = rendered(divided_room(True), gi.LightHierarchy(), range(100, 196), (5,))
+    return {buffer: [images[0], sixth[buffer][0]] for buffer, images in by_hierarchy(False, name).items()}
 
 
 @pytest.mark.parametrize(
@@ -1344,14 +1579,16 @@ def by_power(moves, name):
     [(False, "hierarchy"), (True, "hierarchy"), (True, "table")],
     ids=["still", "moving", "moving-table"],
 )
-def test_pictures_equal_those_by_power(moves, explores_by):
+def test_pictures_equal_those_of_the_hierarchy(moves, explores_by):
     """The first frame, in which nothing is known, and the sixth; and the cache is worth it: lamps are hidden."""
     ours = rendered(divided_room(moves), gi.VisibilityLightCache(explores_by=explores_by), range(1, 25), (0, 5))
-    theirs = by_power(moves, device().alias)
+    theirs = by_hierarchy(moves, device().alias)
     for buffer in ours:
         for k, index in enumerate((0, 5)):
+            if index == 0 and explores_by == "table":  # by power alone, which few seeds say little of
+                continue
             mean, variance = st.mean_and_variance(theirs[buffer][k])
             name = f"light_cache_{explores_by}_{buffer}_{index}"
-            st.compare_images(name, ours[buffer][k], mean, variance, 1e-4, 95, noise_ratio=0.5)
+            st.compare_images(name, ours[buffer][k], mean, variance, 1e-4, 95, noise_ratio=0.1)
     noise = [np.median(images["emitters"][1].var(axis=0).mean(axis=-1)) for images in (ours, theirs)]
-    assert noise[0] < 0.05 * noise[1], noise
+    assert noise[0] < 0.5 * noise[1], noise

@@ -169,7 +169,7 @@ def test_heat_is_what_leaves_hold(scheduler, frame, tmp_path, scales):
     shown = {
         "samples": ("samples a leaf, frame 3", counts, None),
         "lights": ("lights in the cache", lights, None),
-        "exploration": ("explore", cache.tables.exploration.numpy(), 0.1),
+        "exploration": ("explore", cache.tables.exploration.numpy(), 1.0),
         "bsdf_share": ("BSDF", scheduler.state("indirect").guides.shares.numpy()[:, 0], 1.0),
     }
     for name, (words, values, wanted) in shown.items():

@@ -244,7 +244,6 @@ def test_caches_and_quadtrees_have_less_noise():
     [
         (lambda: gi.VisibilityLightCache(capacity=0), "capacity must be from 1 to 32, got 0"),
         (lambda: gi.VisibilityLightCache(exploration=0.0), "exploration must be above 0"),
-        (lambda: gi.VisibilityLightCache(least_exploration=0.5), "least_exploration"),
         (lambda: gi.VisibilityLightCache(explores_by="tabel"), "did you mean 'table'"),
         (lambda: gi.VisibilityLightCache(explores_by="table", energy=0.0, distance=0.0), "above 0"),
         (lambda: gi.GuidedPaths(bits=48), "bits must be one of 32, 64, 96, 128, got 48"),

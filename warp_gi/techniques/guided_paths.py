@@ -33,7 +33,7 @@ class GuidedPaths(BsdfPaths):
     """Leaves of a quadtree that may move in a frame; 1 in the paper."""
     significance: float = 0.5
     """Leaves move only where the squared light of one, times this, exceeds that of the four given up."""
-    fading: float = 0.8
+    fading: float = 0.5
     """Share that the light of earlier frames keeps in what a quadtree adapts to; 0 is the last frame alone, as in
     the paper."""
     bsdf_share: float = 0.5
@@ -88,6 +88,10 @@ class GuidedPaths(BsdfPaths):
     def learn(self, lesson: Lesson, state: GuideState) -> GuideState:
         """Adapt the quadtrees to the samples of the frame."""
         device = lesson.device
+        if lesson.octree.leaf_count * 4 * self.bits >= 1 << 31:
+            raise OptionError(
+                f"{lesson.octree.leaf_count:,} leaves are too many for {self.bits} bits; raise octree.split"
+            )
         guides = _guides(lesson.octree.leaf_count, self.bits, device)
         uniform = wp.vec4ui(*quadtree.quadtree_uniform(self.bits))
         inputs = [lesson.origins, state.guides, guides, uniform, self.bsdf_share]

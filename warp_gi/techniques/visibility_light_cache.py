@@ -18,6 +18,7 @@ from warp_gi.techniques.ltc import ltc_table
 from warp_gi.techniques.sample_octree import Lesson, running_sums
 
 EXPLORES_BY = ("hierarchy", "table")
+MOVING_EXPLORATION = 0.3  # least share in a frame whose lights are not where they were
 MOST_EMITTERS = 1 << 23  # entries of lists have 23 bits for them
 
 
@@ -34,9 +35,9 @@ class VisibilityLightCache(Estimator):
     capacity: int = 32
     """Lights a bucket at most, 1 to 32; more lights go to more buckets, of which a sample weighs one."""
     exploration: float = 0.1
-    """Share of samples that explore, at most, in (0, 1]."""
-    least_exploration: float = 0.05
-    """Share that it falls to where nothing new is found; as ``exploration``, it stays."""
+    """Share of samples that explore, in (0, 1): the first one, and the only one unless ``adapts_exploration``."""
+    adapts_exploration: bool = True
+    """Whether each region learns the share that its samples would have varied least with, from 0.05 to 0.9."""
     memory: int = 8
     """Frames that a light stays in a region after it was last seen, 0 to 200."""
     explores_by: str = "hierarchy"
@@ -60,13 +61,8 @@ class VisibilityLightCache(Estimator):
         ):
             if not low <= getattr(self, name) <= high:
                 raise OptionError(f"{name} must be from {low} to {high}, got {getattr(self, name)}")
-        if not 0.0 < self.exploration <= 1.0:
-            raise OptionError(f"exploration must be above 0 and at most 1, got {self.exploration}")
-        if not 0.0 < self.least_exploration <= self.exploration:
-            raise OptionError(
-                f"least_exploration must be above 0 and at most exploration ({self.exploration}), "
-                f"got {self.least_exploration}"
-            )
+        if not 0.0 < self.exploration < 1.0:
+            raise OptionError(f"exploration must be above 0 and below 1, got {self.exploration}")
         if self.explores_by not in EXPLORES_BY:
             raise unknown_name("way to explore", self.explores_by, EXPLORES_BY)
         weights = (self.energy, self.change, self.distance)
@@ -114,10 +110,10 @@ class VisibilityLightCache(Estimator):
             inputs = [frame.data, launch.on_device(luminances, wp.float32, device), shapes]
             frame.launch(light_cache.shape_lights, inputs, len(centers))
             state = replace(state, centers=centers, shapes=shapes, emitters=emitters.emitters)
-        if moved.any():  # what is known is in doubt everywhere
+        if moved.any() and self.adapts_exploration:  # what is known is in doubt: explore, and learn the share anew
             tables = launch.copied(state.tables, light_cache.CacheTables)
-            leaves = tables.buckets.shape[0]
-            tables.exploration = wp.full(leaves, self.exploration, dtype=wp.float32, device=device)
+            doubtful = _tables(tables.buckets.shape[0], device, max(self.exploration, MOVING_EXPLORATION))
+            tables.exploration, tables.moments = doubtful.exploration, doubtful.moments
             state = replace(state, tables=tables)
         cache = light_cache.LightCache()
         cache.shapes, cache.emitters = state.shapes, state.emitters
@@ -151,13 +147,11 @@ class VisibilityLightCache(Estimator):
         settings = light_cache_build.CacheSettings()
         settings.capacity, settings.memory = self.capacity, self.memory
         settings.hysteresis = 0.75
-        settings.exploration, settings.least_exploration = self.exploration, self.least_exploration
         samples, origins = lesson.leaf_samples(self.samples), lesson.origins
 
         seen = _lists(leaves, device)
         seen.entries = wp.empty(2 * samples.order.shape[0], dtype=wp.int32, device=device)
-        discoveries = wp.empty(leaves, dtype=wp.int32, device=device)
-        lesson.launch(light_cache_build.list_seen_lights, [samples, lesson.records.lights, seen, discoveries])
+        lesson.launch(light_cache_build.list_seen_lights, [samples, lesson.records.lights, seen])
         joined = _lists(leaves, device)
         around = [seen, state.known, lesson.neighbours, origins]
         lesson.launch(light_cache_build.bound_lists, [*around, joined.counts])
@@ -179,8 +173,9 @@ class VisibilityLightCache(Estimator):
         tables.items = wp.zeros(size, dtype=wp.int32, device=device)
         tables.chances = wp.zeros(size, dtype=wp.float32, device=device)
         lesson.launch(light_cache_build.fill_buckets, [settings, joined, importances, sums, tables])
-        inputs = [settings, samples, discoveries, origins, state.tables.exploration, tables.exploration]
-        lesson.launch(light_cache_build.adapt_exploration, inputs)
+        if self.adapts_exploration:
+            inputs = [samples, lesson.records, origins, state.tables, tables, self.exploration]
+            lesson.launch(light_cache_build.adapt_exploration, inputs)
         return replace(state, tables=tables, known=joined)
 
 
@@ -208,6 +203,7 @@ def _tables(leaves: int, device: wp.Device, exploration: float) -> light_cache.C
     tables.items = wp.zeros(0, dtype=wp.int32, device=device)
     tables.chances = wp.zeros(0, dtype=wp.float32, device=device)
     tables.exploration = wp.full(leaves, exploration, dtype=wp.float32, device=device)
+    tables.moments = wp.zeros(leaves, dtype=light_cache.ExplorationMoments, device=device)
     return tables
 
 
