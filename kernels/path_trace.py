@@ -315,7 +315,7 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
             if is_last:
                 break
             if depth >= paths.roulette_depth:
-                survival = wp.min(wp.max(reflected), 0.95)
+                survival = wp.min(wp.max(wp.max(throughput), wp.max(reflected)), 0.95)
                 if random_1d(index, seed, d + 6) >= survival:
                     break
                 throughput = throughput / survival
