@@ -8,6 +8,7 @@ samples, and the one with the least sum is taken. Sums of earlier frames fade.
 import warp as wp
 
 from warp_gi.kernels.light_cache_build import LeafSamples
+from warp_gi.kernels.quadtree_adapt import LARGEST_CONTRIBUTION
 from warp_gi.kernels.samples import SURFACE_GLOSSY, SampleRecords, mixture_densities
 
 wp.set_module_options({"enable_backward": False})
@@ -99,7 +100,7 @@ def adapt_shares(
         i = wp.int32(wp.int64(k) * wp.int64(count) / wp.int64(looks))
         slot = samples.order[samples.starts[leaf] + i]
         contribution = records.contributions[slot]
-        if contribution > 0.0 and contribution < 1.0e18:  # its square is finite
+        if contribution > 0.0 and contribution < LARGEST_CONTRIBUTION:
             densities = mixture_densities(records.mixtures[slot])
             square = contribution * contribution
             is_glossy = (records.lights[slot] & SURFACE_GLOSSY) != wp.uint32(0)

@@ -24,7 +24,7 @@ from warp_gi.kernels.types import EMITTER_TRIANGLE, Emitter, SceneData
 
 wp.set_module_options({"enable_backward": False})
 
-MOST_BUCKETS = wp.constant(64)  # of a region
+MOST_BUCKETS = wp.constant(64)  # of a region, beside its first
 
 
 EXPLORATIONS = 6  # shares of exploration that are tried
@@ -217,7 +217,7 @@ def cached_light(
         if r.item >= 0:
             found = find_light(cache.tables, here, r.item)
     else:
-        rest = (u[0] - here.explores) / (1.0 - here.explores)
+        rest = wp.min((u[0] - here.explores) / (1.0 - here.explores), LARGEST_FLOAT_BELOW_ONE)
         number = int(0)
         while number < here.buckets - 1 and rest >= cache.tables.chances[here.items + number]:
             number += 1

@@ -2,10 +2,9 @@
 
 Lights that a region's samples saw are listed once each (`list_seen_lights`), joined with those of its six neighbours
 and with what it knew before (`join_lights`), ranked (`rank_lights`), and spread over buckets (`count_buckets`,
-`fill_buckets`). Lists are
-sorted by emitter, so joining is a merge, and buckets come out sorted. An entry is emitter << 8 | frames since a sample
-of the region or its neighbours saw it: a light that is seen rarely stays for some frames, which the paper leaves for
-future work (section 8).
+`fill_buckets`). Lists are sorted by emitter, so joining is a merge, and buckets come out sorted. An entry is
+emitter << 8 | frames since a sample of the region or its neighbours saw it: a light that is seen rarely stays for some
+frames, which the paper leaves for future work (section 8).
 """
 
 import warp as wp
@@ -13,6 +12,7 @@ import warp as wp
 from warp_gi.kernels.bsdf import luminance
 from warp_gi.kernels.light_cache import EXPLORATIONS, MOST_BUCKETS, CacheTables, ExplorationMoments, LightCache
 from warp_gi.kernels.octree import NEIGHBOURS, Octree, OctreeNodes, leaf_cell
+from warp_gi.kernels.quadtree_adapt import LARGEST_CONTRIBUTION
 from warp_gi.kernels.samples import LIGHT_ITEM, LIGHT_VISIBLE, SampleRecords, mixture_densities
 from warp_gi.kernels.types import EMITTER_DIRECTIONAL, EMITTER_TRIANGLE
 
@@ -372,9 +372,10 @@ def adapt_exploration(
             slot = samples.order[samples.starts[leaf] + i]
             if (records.lights[slot] & LIGHT_VISIBLE) != wp.uint32(0):
                 word = records.light_mixtures[slot]
-                square = records.light_values[slot] * records.light_values[slot]
+                value = records.light_values[slot]
                 # a region that knew nothing could only explore, which says nothing
-                if (word >> wp.uint32(16)) < wp.uint32(65535) and square < wp.inf:
+                if (word >> wp.uint32(16)) < wp.uint32(65535) and value < LARGEST_CONTRIBUTION:
+                    square = value * value
                     densities = mixture_densities(word)
                     for c in range(EXPLORATIONS):
                         a = candidate_exploration(c)

@@ -44,6 +44,7 @@ class Regions(NamedTuple):
     data: Any  # struct
     find: wp.Function  # (data, scene, surface, face, u, v) -> region
     slot: wp.Function  # (data, path: int64) -> first slot of its samples, or -1: keep none
+    at: wp.Function  # (data, slot, vertex) -> slot of a vertex of the path, or -1: keep none
     begin: wp.Function  # (data, slot, surface): a sample at a vertex
     light: wp.Function  # (data, slot, choice, whether it arrives, luminance that it brings to the picture)
     direction: wp.Function  # (data, slot, surface, sample, light of the path so far)
@@ -146,6 +147,11 @@ def no_slot(data: NoRegions, path: wp.int64) -> wp.int32:
 
 
 @wp.func
+def no_vertex(data: NoRegions, slot: wp.int32, vertex: wp.int32) -> wp.int32:
+    return -1
+
+
+@wp.func
 def keep_no_vertex(data: NoRegions, slot: wp.int32, s: Surface):
     pass
 
@@ -168,5 +174,5 @@ def keep_no_end(data: NoRegions, slot: wp.int32, vertices: wp.int32, light: wp.f
 ALIAS_LIGHTS = LightSampler("alias", AliasLights, alias_light, alias_light_pdf)
 BSDF_DIRECTIONS = DirectionSampler("bsdf", BsdfDirections, bsdf_direction, bsdf_direction_pdf)
 NO_REGIONS = Regions(
-    "none", NoRegions, no_region, no_slot, keep_no_vertex, keep_no_light, keep_no_direction, keep_no_end
+    "none", NoRegions, no_region, no_slot, no_vertex, keep_no_vertex, keep_no_light, keep_no_direction, keep_no_end
 )

@@ -163,7 +163,7 @@ class PathTracer(NamedTuple):
 
 @cache
 def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Regions) -> PathTracer:
-    """Return the path tracer that uses these samplers; made once."""
+    """Return the path tracer that uses these samplers; made once. The regions follow from the samplers."""
 
     light_data, direction_data, region_data = lights.data, directions.data, regions.data
 
@@ -201,8 +201,9 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
             d = 1 + (depth - 2) * DIMENSIONS
             wo = wp.transpose(s.shading) * view
             region = regions.find(samplers.regions, scene, s, hit.face, hit.u, hit.v)
-            if slot >= 0:
-                regions.begin(samplers.regions, slot + vertices, s)
+            at = regions.at(samplers.regions, slot, vertices)
+            if at >= 0:
+                regions.begin(samplers.regions, at, s)
             # which lights to sample: both at the first vertex, where they are two terms; else one of them
             sky_share = paths.sky_probability
             emitter_share = 1.0 - sky_share
@@ -277,17 +278,16 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
                 else:
                     light = wp.cw_mul(throughput, light)
                     r.indirect = r.indirect + light
-                if slot >= 0:
-                    regions.light(samplers.regions, slot + vertices, choice, sample.arrives, luminance(light))
+                if at >= 0:
+                    regions.light(samplers.regions, at, choice, sample.arrives, luminance(light))
             if not goes_on:
                 vertices += 1
                 break
             throughput = wp.cw_mul(throughput, sample_weight(s.bsdf, b.weight))
             reflected = wp.cw_mul(reflected, sample_weight(s.bsdf, b.reflected))
             if hit.face < 0:
-                if slot >= 0:
-                    before = luminance(r.environment + r.indirect)
-                    regions.direction(samplers.regions, slot + vertices, s, b, before)
+                if at >= 0:
+                    regions.direction(samplers.regions, at, s, b, luminance(r.environment + r.indirect))
                 vertices += 1
                 if sees_sky:
                     sky = environment_lookup(scene.environment, wi)
@@ -309,8 +309,8 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
                     r.emitters = r.emitters + light
                 else:
                     r.indirect = r.indirect + light
-            if slot >= 0 and not is_last:
-                regions.direction(samplers.regions, slot + vertices, s, b, luminance(r.environment + r.indirect))
+            if at >= 0 and not is_last:
+                regions.direction(samplers.regions, at, s, b, luminance(r.environment + r.indirect))
             vertices += 1
             if is_last:
                 break

@@ -28,6 +28,7 @@ from warp_gi.kernels.quadtree import (
 
 wp.set_module_options({"enable_backward": False})
 
+LARGEST_CONTRIBUTION = wp.constant(wp.float32(1.0e15))  # samples beyond are left out: their squares would overflow
 LARGEST_FLOAT = wp.constant(wp.float32(3.402823466e38))
 
 
@@ -95,7 +96,7 @@ def add_energies(samples: QuadtreeSamples, adaptation: QuadtreeAdaptation, item:
             place = wp.int32(wp.int64(i) * wp.int64(count) / wp.int64(taken))
         record = samples.order[samples.starts[item] + place]
         contribution = samples.contributions[record]
-        if contribution >= 0.0:
+        if contribution >= 0.0 and contribution < LARGEST_CONTRIBUTION:
             code = samples.directions[record]
             leaf = quadtree_descend(tree, code << wp.uint32(16), code >> wp.uint32(16) << wp.uint32(16))
             energy = weight * contribution * contribution * square_density(code, samples.pdfs[record])

@@ -104,7 +104,7 @@ def map_incident_light(first: wp.int32, scene: SceneData, incident: IncidentMap)
     incident.light[texel] = total / wp.float32(incident.rays)
 
 
-# Thread: a pixel of an octahedral incident. The density [1/sr] of the direction in its middle, and the quadtree's leaf.
+# Thread: a pixel of an octahedral map. The density [1/sr] of the direction in its middle, and the quadtree's leaf.
 @wp.kernel
 def map_quadtree(
     first: wp.int32,

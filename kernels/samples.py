@@ -82,6 +82,14 @@ def sample_slot(data: SampleRegions, path: wp.int64) -> wp.int32:
     return wp.int32(group) * data.records.vertices
 
 
+# Paths may go on for longer than there are slots.
+@wp.func
+def sample_vertex(data: SampleRegions, slot: wp.int32, vertex: wp.int32) -> wp.int32:
+    if slot < 0 or vertex >= data.records.vertices:
+        return -1
+    return slot + vertex
+
+
 @wp.func
 def keep_vertex(data: SampleRegions, slot: wp.int32, s: Surface):
     data.records.codes[slot] = cell_code(data.octree, s.position)
@@ -114,7 +122,7 @@ def keep_direction(data: SampleRegions, slot: wp.int32, s: Surface, sample: Dire
 
 @wp.func
 def keep_end(data: SampleRegions, slot: wp.int32, vertices: wp.int32, light: wp.float32):
-    for vertex in range(vertices):
+    for vertex in range(wp.min(vertices, data.records.vertices)):
         before = data.records.contributions[slot + vertex]
         if before >= 0.0:
             data.records.contributions[slot + vertex] = wp.max(light - before, 0.0)
@@ -125,6 +133,7 @@ SAMPLE_REGIONS = Regions(
     SampleRegions,
     sample_region,
     sample_slot,
+    sample_vertex,
     keep_vertex,
     keep_light,
     keep_direction,

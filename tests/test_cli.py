@@ -154,6 +154,10 @@ def test_learnt_frames_go_on_from_the_saved_state(tmp_path, capsys):
     assert cli.main([*command, "--frames=0-3", "--resume"]) == 0
     printed = capsys.readouterr().out
     assert "2 of 4 frames are there already" in printed and "again" not in printed
+    assert cli.main([*command, "--frames=2-3", "--resume"]) == 0  # which learnt from others
+    assert "a.0002.exr is rendered again: lineage is" in capsys.readouterr().out
+    assert cli.main([*command, "--frames=0-3", "--resume"]) == 0
+    capsys.readouterr()
     (tmp_path / "a.0002.exr").unlink()
     assert cli.main([*command, "--frames=0-3", "--resume"]) == 0
     assert "every frame is rendered again: no saved state fits" in capsys.readouterr().out

@@ -739,7 +739,7 @@ def test_exploration_goes_after_lights_that_move():
     frame, state = preprocessed(scene, estimator, state, 0.5)
     assert explored_by_table(frame)[:2].sum() > 0.98 > before[:2].sum()
     assert np.allclose(state.tables.exploration.numpy(), MOVING_EXPLORATION), "what is known is in doubt"
-    assert MOVING_EXPLORATION == 0.3 and (state.tables.moments.numpy() == 0).all()
+    assert MOVING_EXPLORATION == 0.3 and (state.tables.moments.numpy() == 7).all(), "and learnt on from there"
     state.tables.exploration.fill_(0.03)
     state.tables.moments.fill_(7.0)
     frame, state = preprocessed(scene, estimator, state, 0.5)  # now it stands still

@@ -639,7 +639,7 @@ def test_threads_do_not_matter():
     [
         ({"collapse": 0}, "collapse"),
         ({"split": 100}, "collapse"),
-        ({"split": 0, "collapse": 0}, "collapse"),
+        ({"split": 0, "collapse": 0}, "split"),
         ({"collapse": float("nan")}, "collapse"),
         ({"most_samples": 1023}, "most_samples"),
         ({"most_samples": (1 << 28) + 1}, "most_samples"),

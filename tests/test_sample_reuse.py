@@ -177,6 +177,28 @@ def test_a_saved_state_goes_on_bit_for_bit(tmp_path, stopped):
         assert_same(buffers(resumed.frame(index)), unbroken[index])
 
 
+def test_any_indirect_light_goes_with_a_cache(tmp_path):
+    """Settings of other kinds than numbers and text are in the state's file, too."""
+    chosen = pipeline(indirect=gi.LightFieldProbes(mode="irradiance", counts=(2, 1, 2), resolution=16, rays=1))
+    scheduler, _ = sequence([0, 1], hall(), chosen)
+    scheduler.save_state(tmp_path / "a.safetensors")
+    other, _ = sequence([], hall(), chosen)
+    other.load_state(tmp_path / "a.safetensors")
+    assert_same(buffers(other.frame(2)), buffers(scheduler.frame(2)))
+
+
+def test_paths_may_be_longer_than_what_is_kept_of_them():
+    """Of long paths the first vertices are kept; and nothing of one in the slots of another."""
+    closed = hall(sky=False)
+    chosen = pipeline(indirect=gi.GuidedPaths(max_depth=40, roulette_depth=40), spp=1)
+    scheduler, frames = sequence([0], closed, chosen)
+    records = scheduler._records
+    assert records.vertices == 12 and records.codes.shape[0] % 12 == 0
+    used = (records.codes.numpy().reshape(-1, 12) != 0xFFFFFFFF).sum(axis=1)
+    assert used.max() == 12
+    assert np.isfinite(frames[0]["beauty"]).all()
+
+
 def test_states_fit_only_their_own(tmp_path):
     scheduler, _ = sequence([0, 1])
     path = scheduler.save_state(tmp_path / "a.safetensors", "frames")
@@ -242,15 +264,17 @@ def test_caches_and_quadtrees_have_less_noise():
 @pytest.mark.parametrize(
     "make, words",
     [
-        (lambda: gi.VisibilityLightCache(capacity=0), "capacity must be from 1 to 32, got 0"),
+        (lambda: gi.VisibilityLightCache(capacity=0), "capacity must be a whole number from 1 to 32, got 0"),
         (lambda: gi.VisibilityLightCache(exploration=0.0), "exploration must be above 0"),
         (lambda: gi.VisibilityLightCache(explores_by="tabel"), "did you mean 'table'"),
         (lambda: gi.VisibilityLightCache(explores_by="table", energy=0.0, distance=0.0), "above 0"),
+        (lambda: gi.GuidedPaths(bits=128.0), "bits must be a whole number"),
+        (lambda: gi.Pipeline(octree=None), "octree must be a SampleOctree"),
         (lambda: gi.GuidedPaths(bits=48), "bits must be one of 32, 64, 96, 128, got 48"),
         (lambda: gi.GuidedPaths(bsdf_share=0.0), "bsdf_share"),
         (lambda: gi.GuidedPaths(fading=1.0), "fading"),
         (lambda: gi.GuidedPaths(max_depth=1), "max_depth"),
-        (lambda: gi.SampleOctree(split=10, collapse=20), "collapse must be from 1 to split"),
+        (lambda: gi.SampleOctree(split=10, collapse=20), "collapse must be at most octree.split"),
     ],
 )
 def test_settings_are_checked(make, words):

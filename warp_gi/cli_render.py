@@ -115,6 +115,8 @@ class Shot:
     """Seconds."""
     camera: Camera
     previous_camera: Camera
+    lineage: str = ""
+    """Hash of all that decides this frame and those before it, where light is learnt from them."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -214,18 +216,18 @@ def run(options: Render, report: Reporter) -> None:
         check_pictures(scheduler, shots[-1].camera, options.reuse_pixel)
     with report.phase("bake"):
         scheduler.bake()
-    done, lineages = [], []
+    done, before = [], ""
     for shot in shots:
         if options.resume or scheduler.learns:
             turn_sky(options, scene, sky, shot.index)  # what the frame's file has to say
         if scheduler.learns:
-            lineages.append(lineage(options, shot, scheduler, lineages[-1] if lineages else ""))
+            before = shot.lineage = lineage(options, shot, scheduler, before)
         done.append(options.resume and is_done(options, shot, scheduler, report))
     todo = [shot for shot, is_there in zip(shots, done, strict=True) if not is_there]
     if todo and any(done):
         reason = what_remembers(options, scene)
         if reason or scheduler.learns:
-            todo = shots if reason else shots[known_frames(options, scheduler, lineages[: done.index(False)]) :]
+            todo = shots if reason else shots[known_frames(options, scheduler, shots[: done.index(False)]) :]
         if len(todo) == len(shots):
             reason = reason or "no saved state fits, and light is learnt"
             report.line(f"every frame is rendered again: {reason} by the frames before")
@@ -235,8 +237,7 @@ def run(options: Render, report: Reporter) -> None:
         check_writable(options.reuse_pictures)
     if todo:
         check_writable(options.output.parent)
-        if scheduler.learns:
-            remove_stale_parts(state_path(options))
+        remove_stale_parts(state_path(options))
     if len(todo) < len(shots):
         report.line(f"{len(shots) - len(todo)} of {len(shots)} frames are there already")
     started = time.perf_counter()
@@ -248,8 +249,10 @@ def run(options: Render, report: Reporter) -> None:
                 frame, stages = render_shot(options, shot, scheduler, report)
                 for stage, seconds in stages.items():
                     times.setdefault(stage, []).append(seconds)
-                if scheduler.learns:
-                    scheduler.save_state(state_path(options), lineages[shots.index(shot)])
+                if scheduler.learns and shot.path.suffix.lower() == ".exr":  # nothing resumes from others
+                    saving = time.perf_counter()
+                    scheduler.save_state(state_path(options), shot.lineage)
+                    times.setdefault("save state", []).append(time.perf_counter() - saving)
                 if options.reuse_pictures is not None and shot is todo[-1]:
                     reuse_pictures(scheduler, frame, options.reuse_pictures, options.reuse_pixel)
                     report.line(f"pictures: {options.reuse_pictures}")
@@ -273,6 +276,8 @@ def render_shot(
     remove_stale_parts(shot.path)
     started, compiled = time.perf_counter(), launch.compile_seconds
     frame = scheduler.frame(shot.index, shot.previous)
+    if scheduler.learns:
+        frame.metadata["lineage"] = shot.lineage
     rendered = time.perf_counter()
     write_shot(options, frame, shot.path)
     finished = time.perf_counter()
@@ -349,11 +354,12 @@ def lineage(options: Render, shot: Shot, scheduler: FrameScheduler, before: str)
     attributes = frame_attributes(
         shot.index, shot.time, shot.camera, scheduler.metadata(), shot.previous_camera, options.precision
     )
-    return hashlib.sha256(f"{before}{attributes}".encode()).hexdigest()
+    return hashlib.sha256(f"{before}{shot.camera.resolution}{attributes}".encode()).hexdigest()
 
 
-def known_frames(options: Render, scheduler: FrameScheduler, lineages: list[str]) -> int:
+def known_frames(options: Render, scheduler: FrameScheduler, whole: list[Shot]) -> int:
     """Return how many of the first frames, which are whole, a saved state knows; the scheduler then goes on from it."""
+    lineages = [shot.lineage for shot in whole]
     path = state_path(options)
     if not path.exists():
         return 0
@@ -381,9 +387,8 @@ def what_remembers(options: Render, scene: Scene | BakedScene) -> str:
 
 def is_done(options: Render, shot: Shot, scheduler: FrameScheduler, report: Reporter) -> bool:
     """Return whether the frame's file is whole and made with the same settings; adds a missing preview."""
-    expected = frame_attributes(
-        shot.index, shot.time, shot.camera, scheduler.metadata(), shot.previous_camera, options.precision
-    )
+    metadata = scheduler.metadata() | ({"lineage": shot.lineage} if scheduler.learns else {})
+    expected = frame_attributes(shot.index, shot.time, shot.camera, metadata, shot.previous_camera, options.precision)
     problem = why_not_whole(shot.path, expected, shot.camera)
     if problem is None:
         preview = shot.path.with_suffix(".png")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from numbers import Integral
 
 
 class GiError(ValueError):
@@ -28,3 +29,9 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> OptionError:
     near = difflib.get_close_matches(name, known, n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     return OptionError(f"unknown {kind} {name!r}{hint} (known: {', '.join(known)})")
+
+
+def check_whole(name: str, value: object, least: int, most: int) -> None:
+    """Raise OptionError unless a setting is a whole number in a range."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or not least <= value <= most:
+        raise OptionError(f"{name} must be a whole number from {least} to {most}, got {value!r}")

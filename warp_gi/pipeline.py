@@ -68,6 +68,8 @@ class Pipeline:
             object.__setattr__(self, "denoise", denoiser_named(self.denoise))
         if not isinstance(self.denoise, Denoiser | None):
             raise OptionError(f"denoise must be a Denoiser, the name of one, or None, got {self.denoise!r:.80}")
+        if not isinstance(self.octree, SampleOctree):
+            raise OptionError(f"octree must be a SampleOctree, got {self.octree!r:.80}")
         for term, estimator in zip(TERMS, (self.environment, self.emitters, self.indirect), strict=True):
             if estimator is not None and getattr(estimator, "term", None) != term:
                 raise OptionError(f"{term} must be an estimator of that term or None, got {estimator!r}")

@@ -27,6 +27,7 @@ from warp_gi.scene.scene import Scene
 from warp_gi.sequence_state import state_arrays, with_arrays
 from warp_gi.techniques.baselines import BsdfPaths, PowerLights, sky_probability
 
+MOST_VERTICES = 12  # of a path whose samples are kept; few paths get further, and each has room for as many
 _VEC3_BUFFERS = ("beauty", "emission", *TERMS, "albedo", "normal", "position", "variance", "moment1", "moment2")
 BUFFERS = (
     "beauty",
@@ -342,7 +343,7 @@ class FrameScheduler:
     def _open_records(self, frame: Frame) -> None:
         """Let the paths of a frame find regions, and leave samples."""
         indirect = self.pipeline.indirect
-        vertices = indirect.max_depth - 1 if isinstance(indirect, BsdfPaths) else 1
+        vertices = min(indirect.max_depth - 1, MOST_VERTICES) if isinstance(indirect, BsdfPaths) else 1
         data = samples.SampleRegions()
         data.octree, data.moves = self._states["octree"].octree, int(self.scene.is_animated)
         data.records = self._records = self.pipeline.octree.records(frame, vertices, self._records)
@@ -352,10 +353,11 @@ class FrameScheduler:
         """Let every technique that learns take over what the samples of a frame say."""
         with frame.stage("learn octree"):
             lesson = self.pipeline.octree.learn(self._states["octree"], self._records, self.device)
-            self._states["octree"] = lesson.octree
+        learnt = {"octree": lesson.octree}
         for term in self._learners:
             with frame.stage(f"learn {term}"):
-                self._states[term] = self._estimators[term].learn(lesson, self._states[term])
+                learnt[term] = self._estimators[term].learn(lesson, self._states[term])
+        self._states |= learnt  # all or nothing: leaves of one tree have no place in the tables of another
 
     @property
     def learns(self) -> bool:
@@ -377,11 +379,11 @@ class FrameScheduler:
         """
         self.bake()
         saved, wanted = load_bake(path), self._saved_state(lineage, {})
-        saved.check(wanted.technique, wanted.scene_key, wanted.settings, wanted.scene_name)
         try:
+            saved.check(wanted.technique, wanted.scene_key, wanted.settings, wanted.scene_name)
             self._states |= with_arrays(self._learnt(), saved.arrays, self.device)
-        except (KeyError, ValueError) as error:
-            raise BakeError(f"{path}: does not hold the state of these estimators ({error}); delete it") from error
+        except (BakeError, KeyError, ValueError, RuntimeError) as error:
+            raise BakeError(f"{path}: is not the state of this sequence ({error}); delete it") from error
 
     def _learnt(self) -> dict[str, Any]:
         self.bake()
@@ -389,8 +391,7 @@ class FrameScheduler:
 
     def _saved_state(self, lineage: str, arrays: dict[str, np.ndarray]) -> Bake:
         """Return a file's contents; the sky may differ from that of the frame before."""
-        settings = {key: value for key, value in self.metadata().items() if key != "scene_hash"}
-        settings = {key: "None" if value is None else value for key, value in settings.items()}
+        settings = {key: str(value) for key, value in self.metadata().items() if key != "scene_hash"}
         settings |= {"lineage": lineage}
         return Bake("FrameScheduler", self.scene.contents_hash, settings, arrays, scene_name=self.scene.name)
 
@@ -483,7 +484,7 @@ def render(
         frames: Frame numbers in order; None is every frame of the path.
         device: "cpu", "cuda", "cuda:1".
         seed: Every random number follows from it, the frame, the pixel and the sample.
-        skip: Frames that need not be rendered, because they exist already.
+        skip: Frames that need not be rendered, because they exist already. What learns from frames does not see them.
         progress: Called with (stage, share done in [0, 1]).
         bakes: Bakes made before (``gi.bake``, ``gi.load_bake``), each for the estimator that it names.
 

@@ -82,7 +82,7 @@ class BsdfPaths(Estimator):
     max_depth: int = 8
     """Edges of the longest path from camera to light: 2 is direct light only, 3 one bounce."""
     roulette_depth: int = 5
-    """Paths of this many edges and more end at random, by their throughput."""
+    """Paths of this many edges and more end at random, by their throughput or the reflectance they met, the larger."""
     clamp: float = 0.0
     """Largest component of one path's radiance, W/(m^2 sr); darkens fireflies. 0 is no limit."""
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_gi import launch
-from warp_gi.errors import OptionError
+from warp_gi.errors import OptionError, check_whole
 from warp_gi.estimator import SamplerInUse
 from warp_gi.kernels import guided_directions, guided_shares, quadtree, quadtree_adapt
 from warp_gi.techniques.baselines import BsdfPaths
@@ -32,10 +32,11 @@ class GuidedPaths(BsdfPaths):
     migrations: int = 8
     """Leaves of a quadtree that may move in a frame; 1 in the paper."""
     significance: float = 0.5
-    """Leaves move only where the squared light of one, times this, exceeds that of the four given up."""
+    """Leaves move only where what there is to gain by splitting one, times this, exceeds what is lost by giving up
+    four: area times squared light."""
     fading: float = 0.5
-    """Share that the light of earlier frames keeps in what a quadtree adapts to; 0 is the last frame alone, as in
-    the paper."""
+    """Share that the light of earlier frames keeps in what a quadtree adapts to, more where samples are few; 0 is the
+    last frame alone."""
     bsdf_share: float = 0.5
     """Share of directions by the BSDF: the first one, and the only one unless ``adapts_share``."""
     adapts_share: bool = True
@@ -50,9 +51,8 @@ class GuidedPaths(BsdfPaths):
         super().validate()
         if self.bits not in BITS:
             raise OptionError(f"bits must be one of {', '.join(map(str, BITS))}, got {self.bits}")
-        for name, low, high in (("migrations", 0, 32), ("samples", 1, 1 << 24)):
-            if not low <= getattr(self, name) <= high:
-                raise OptionError(f"{name} must be from {low} to {high}, got {getattr(self, name)}")
+        for name, least, most in (("bits", 32, 128), ("migrations", 0, 32), ("samples", 1, 1 << 24)):
+            check_whole(name, getattr(self, name), least, most)
         if not 0.0 <= self.fading < 1.0:
             raise OptionError(f"fading must be from 0 to below 1, got {self.fading}")
         if not 0.0 <= self.significance <= 1.0:

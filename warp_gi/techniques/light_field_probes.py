@@ -12,7 +12,7 @@ import numpy as np
 from warp_gi import launch
 from warp_gi.baking import Bake
 from warp_gi.camera import Camera, CameraPath
-from warp_gi.errors import BakeError, OptionError, unknown_name
+from warp_gi.errors import BakeError, OptionError, check_whole, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_trace as trace_kernels
@@ -91,13 +91,13 @@ class LightFieldProbes(Estimator):
             ("pixel_rays", 0, 1 << 20),
             ("update", 0, 1 << 20),
         ):
-            _check_whole(name, getattr(self, name), least, most)
+            check_whole(name, getattr(self, name), least, most)
         if self.resolution % block:
             raise OptionError(f"resolution must be a multiple of {block}, got {self.resolution}")
         if not isinstance(self.counts, tuple | list) or len(self.counts) != 3:
             raise OptionError(f"counts must be three whole numbers, along x, y and z, got {self.counts!r}")
         for count in self.counts:
-            _check_whole("counts", count, 0, 1 << 20)
+            check_whole("counts", count, 0, 1 << 20)
         if not (math.isfinite(self.spacing) and self.spacing >= 0):
             raise OptionError(f"spacing must be 0 (automatic) or metres above it, got {self.spacing}")
         if self.spacing and all(self.counts):
@@ -214,11 +214,6 @@ class LightFieldProbes(Estimator):
         buffers = frame.struct(trace_kernels.ProbeView)
         inputs = [frame.camera_data, frame.pass_settings, state.field, buffers]
         frame.launch_tiled(trace_kernels.view_probes, inputs)
-
-
-def _check_whole(name: str, value: object, least: int, most: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
-        raise OptionError(f"{name} must be a whole number from {least} to {most}, got {value!r}")
 
 
 def _key(scene: Any, time: float) -> str:

@@ -20,6 +20,7 @@ from warp_gi.kernels import light_hierarchy as kernels
 from warp_gi.kernels import types
 from warp_gi.launch import on_device
 from warp_gi.scene.scene import Scene
+from warp_gi.scene.textures import LUMINANCE
 
 LANES = kernels.LANES
 EMPTY = np.iinfo(np.int64).min
@@ -105,7 +106,7 @@ def emitter_bounds(scene: Scene, data: types.SceneData) -> EmitterBounds:
     low = table["position"].astype(np.float64)
     high, axis = low.copy(), table["direction"].astype(np.float64)
     facing, falloff = np.zeros(count), np.full(count, np.pi / 2)
-    solid_angle = np.full(count, np.pi)  # flux over the intensity straight ahead
+    power = table["intensity"].astype(np.float64) @ LUMINANCE  # straight ahead
 
     triangles = np.flatnonzero(kind == types.EMITTER_TRIANGLE)
     if len(triangles):
@@ -115,18 +116,14 @@ def emitter_bounds(scene: Scene, data: types.SceneData) -> EmitterBounds:
         axis[triangles] = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         both = data.materials.numpy()["double_sided"][data.geometry.materials.numpy()[faces]] != 0
         facing[triangles[both]] = np.pi
-        solid_angle[triangles[both]] = 2 * np.pi
+        power[triangles] = flux[triangles] / np.where(both, 2 * np.pi, np.pi)
     points = kind == types.EMITTER_POINT
     facing[points] = np.pi
-    solid_angle[points] = 4 * np.pi
     spots = kind == types.EMITTER_SPOT
     inner = np.arccos(np.clip(table["cos_inner"][spots].astype(np.float64), -1, 1))
     outer = np.arccos(np.clip(table["cos_outer"][spots].astype(np.float64), -1, 1))
     facing[spots], falloff[spots] = inner, outer - inner
-    solid_angle[spots] = 2 * np.pi * (1 - 0.5 * (np.cos(inner) + np.cos(outer)))
-    return EmitterBounds(
-        low, high, _unit(axis), facing, falloff, flux / solid_angle, kind == types.EMITTER_DIRECTIONAL, flux
-    )
+    return EmitterBounds(low, high, _unit(axis), facing, falloff, power, kind == types.EMITTER_DIRECTIONAL, flux)
 
 
 def build_tree(bounds: EmitterBounds) -> TreeArrays:

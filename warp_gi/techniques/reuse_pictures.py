@@ -71,7 +71,8 @@ def reuse_pictures(
     if isinstance(scheduler.pipeline.emitters, VisibilityLightCache):
         known = scheduler.state("emitters")
         if known is not None:
-            shares, most = known.tables.exploration.numpy(), 1.0
+            shares, most = known.tables.exploration.numpy().copy(), 1.0
+            shares[known.tables.buckets.numpy() == 0] = 1.0  # where nothing is known, all samples explore
             pictures["lights"] = _draw_counts(leaves, cached_lights(known.tables), "lights in the cache of a leaf")
             title = _about(leaves, shares, "share of samples that explore")
             pictures["exploration"] = _draw_values(leaves, shares, round_above(most), title)

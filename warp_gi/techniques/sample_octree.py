@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_gi import launch
-from warp_gi.errors import OptionError
+from warp_gi.errors import OptionError, check_whole
 from warp_gi.kernels import gbuffer, octree, samples
 from warp_gi.kernels.light_cache_build import LeafSamples
 
@@ -33,13 +33,10 @@ class SampleOctree:
     """Samples that are kept of a frame at most, 32 bytes each; of more paths, every second, third ... is recorded."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.collapse <= self.split <= MOST_SAMPLES:
-            raise OptionError(
-                f"octree: collapse must be from 1 to split, and split at most {MOST_SAMPLES:,}, "
-                f"got {self.collapse} and {self.split}"
-            )
-        if not 1024 <= self.most_samples <= MOST_SAMPLES:
-            raise OptionError(f"octree: most_samples must be from 1,024 to 2^28, got {self.most_samples}")
+        for name, least in (("split", 1), ("collapse", 1), ("most_samples", 1024)):
+            check_whole(f"octree.{name}", getattr(self, name), least, MOST_SAMPLES)
+        if self.collapse > self.split:
+            raise OptionError(f"octree.collapse must be at most octree.split ({self.split}), got {self.collapse}")
 
     def start(self, scene: Any, device: wp.Device) -> OctreeState:
         """Return a tree whose root has eight leaves, over the cube around the scene's bounds in all of its time."""
@@ -163,7 +160,12 @@ class Lesson:
 
 
 def running_sums(counts: wp.array) -> tuple[wp.array, int]:
-    """Return where each item begins if ``counts`` [int32] of them stand one after another, and the sum."""
+    """Return where each item begins if ``counts`` [int32] of them stand one after another, and the sum.
+
+    Raises OptionError where that is beyond what 32 bits count.
+    """
+    if counts.shape[0] > MOST_SAMPLES // 1024 and int(counts.numpy().sum(dtype=np.int64)) >= 1 << 31:
+        raise OptionError(f"{counts.shape[0]:,} leaves know too many lights together; raise octree.split")
     offsets = wp.empty_like(counts)
     wp.utils.array_scan(counts, offsets, inclusive=False)
     last = slice(counts.shape[0] - 1, counts.shape[0])

@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_gi import launch
 from warp_gi.alias import AliasTable
-from warp_gi.errors import OptionError, unknown_name
+from warp_gi.errors import OptionError, check_whole, unknown_name
 from warp_gi.estimator import Estimator, SamplerInUse
 from warp_gi.kernels import light_cache, light_cache_build, light_cache_native, path_trace, types
 from warp_gi.techniques.light_hierarchy import TreeState, first_tree, moved_tree
@@ -24,7 +24,7 @@ MOST_EMITTERS = 1 << 23  # entries of lists have 23 bits for them
 
 @dataclass(frozen=True)
 class VisibilityLightCache(Estimator):
-    """Direct light from emitters, of which each region samples those that the frame before found visible there.
+    """Direct light from emitters, of which each region samples those that it or a neighbour of it saw lately.
 
     Lights are selected by what they reflect at the very point: the closed-form cosine integral of their triangle, and
     linearly transformed cosines for GGX. A share of samples explores. Unbiased. Every path vertex uses it.
@@ -35,7 +35,8 @@ class VisibilityLightCache(Estimator):
     capacity: int = 32
     """Lights a bucket at most, 1 to 32; more lights go to more buckets, of which a sample weighs one."""
     exploration: float = 0.1
-    """Share of samples that explore, in (0, 1): the first one, and the only one unless ``adapts_exploration``."""
+    """Share of samples that explore, in (0, 1): the first one, and the only one unless ``adapts_exploration``; at
+    least 0.3 then in frames in which a light moves."""
     adapts_exploration: bool = True
     """Whether each region learns the share that its samples would have varied least with, from 0.05 to 0.9."""
     memory: int = 8
@@ -54,13 +55,12 @@ class VisibilityLightCache(Estimator):
 
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
-        for name, low, high in (
+        for name, least, most in (
             ("capacity", 1, light_cache_native.CAPACITY),
             ("memory", 0, 200),
             ("samples", 1, 1 << 24),
         ):
-            if not low <= getattr(self, name) <= high:
-                raise OptionError(f"{name} must be from {low} to {high}, got {getattr(self, name)}")
+            check_whole(name, getattr(self, name), least, most)
         if not 0.0 < self.exploration < 1.0:
             raise OptionError(f"exploration must be above 0 and below 1, got {self.exploration}")
         if self.explores_by not in EXPLORES_BY:
@@ -91,8 +91,10 @@ class VisibilityLightCache(Estimator):
             )
         device = launch.get_device(device)
         tree = first_tree(scene, device)
-        centers = _places(scene.data(device))[0]
-        return CacheState(_tables(8, device, self.exploration), _lists(8, device), centers, tree)
+        places, areas = _places(scene.data(device))
+        radiances = scene.emitter_powers() / (np.pi * np.maximum(areas, 1e-30)) * (areas > 0)
+        luminances = launch.on_device(radiances.astype(np.float32), wp.float32, device)
+        return CacheState(_tables(8, device, self.exploration), _lists(8, device), places, tree, luminances)
 
     def preprocess(self, frame: Any, state: CacheState | None) -> CacheState | None:
         """Bring the shapes of lights and the table of exploration up to the frame, and give paths the cache."""
@@ -100,20 +102,17 @@ class VisibilityLightCache(Estimator):
             return None
         scene, device = frame.scene, frame.device
         emitters = frame.data.emitters
-        powers = scene.emitter_powers()
-        centers, moved = state.centers, np.zeros(len(powers))
+        moved = np.zeros(scene.emitter_count)
         if state.shapes is None or scene.is_animated:
-            centers, areas, sides = _places(frame.data)
-            moved = _distances(centers, state.centers)
-            luminances = (powers / (np.pi * np.maximum(areas * sides, 1e-30)) * (areas > 0)).astype(np.float32)
-            shapes = wp.empty(len(centers), dtype=light_cache_native.LightShape, device=device)
-            inputs = [frame.data, launch.on_device(luminances, wp.float32, device), shapes]
-            frame.launch(light_cache.shape_lights, inputs, len(centers))
-            state = replace(state, centers=centers, shapes=shapes, emitters=emitters.emitters)
-        if moved.any() and self.adapts_exploration:  # what is known is in doubt: explore, and learn the share anew
+            places, _ = _places(frame.data)
+            moved = np.linalg.norm(places - state.places, axis=1)
+            shapes = wp.empty(len(places), dtype=light_cache_native.LightShape, device=device)
+            frame.launch(light_cache.shape_lights, [frame.data, state.luminances, shapes], len(places))
+            state = replace(state, places=places, shapes=shapes, emitters=emitters.emitters)
+        if moved.any() and self.adapts_exploration:  # what is known is in doubt
             tables = launch.copied(state.tables, light_cache.CacheTables)
-            doubtful = _tables(tables.buckets.shape[0], device, max(self.exploration, MOVING_EXPLORATION))
-            tables.exploration, tables.moments = doubtful.exploration, doubtful.moments
+            shares = np.maximum(tables.exploration.numpy(), np.float32(max(self.exploration, MOVING_EXPLORATION)))
+            tables.exploration = launch.on_device(shares, wp.float32, device)
             state = replace(state, tables=tables)
         cache = light_cache.LightCache()
         cache.shapes, cache.emitters = state.shapes, state.emitters
@@ -122,13 +121,15 @@ class VisibilityLightCache(Estimator):
             state = replace(state, tree=moved_tree(frame, state.tree))
             cache.explores_by_tree, cache.tree = 1, state.tree.data
         else:
-            emitters.alias = AliasTable.build(self._table(frame, powers, moved, centers)).on(device)
+            emitters.alias = AliasTable.build(self._table(frame, moved, state.places[:, :3])).on(device)
         frame.lights = SamplerInUse(light_cache.CACHED_LIGHTS, cache)
         return state
 
-    def _table(self, frame: Any, powers: np.ndarray, moved: np.ndarray, centers: np.ndarray) -> np.ndarray:
+    def _table(self, frame: Any, moved: np.ndarray, centers: np.ndarray) -> np.ndarray:
         """Return the relative probabilities of exploring each light (section 4.3)."""
-        near = 1.0 / (_distances(centers, frame.camera.position) ** 2 + (0.02 * frame.scene.radius) ** 2)
+        powers = frame.scene.emitter_powers()
+        away = np.linalg.norm(centers - np.asarray(frame.camera.position, np.float64), axis=1)
+        near = 1.0 / (away**2 + (0.02 * frame.scene.radius) ** 2)
         weights = np.zeros(len(powers))
         for share, part in ((self.energy, powers), (self.change, powers * moved), (self.distance, near * (powers > 0))):
             if part.sum() > 0:
@@ -186,10 +187,12 @@ class CacheState:
     tables: light_cache.CacheTables
     known: light_cache_build.LightLists
     """Every region's lights with the frames since they were seen, of which the tables are made."""
-    centers: np.ndarray
-    """float64 [emitter, 3] metres, in the last frame."""
+    places: np.ndarray
+    """float64 [emitter, 6] where each was in the last frame, and how it was turned."""
     tree: TreeState = field(metadata={"derived": True})
     """For exploration."""
+    luminances: wp.array = field(metadata={"derived": True})
+    """float32 [emitter] of the mean radiance of emissive triangles, 0 of others."""
     shapes: wp.array | None = field(default=None, metadata={"derived": True})
     """LightShape [emitter]; None before the first frame."""
     emitters: wp.array | None = field(default=None, metadata={"derived": True})
@@ -215,19 +218,15 @@ def _lists(leaves: int, device: wp.Device) -> light_cache_build.LightLists:
     return lists
 
 
-def _places(data: types.SceneData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return centre [n, 3], area and number of emitting sides of each emitter; area 0 for lights without size."""
+def _places(data: types.SceneData) -> tuple[np.ndarray, np.ndarray]:
+    """Return centre and turn of each emitter, float64 [n, 6], and the area of its emitting sides, 0 without size."""
     table = data.emitters.emitters.numpy()
-    centers, areas, sides = table["position"].astype(np.float64), np.zeros(len(table)), np.ones(len(table))
+    places = np.concatenate([table["position"], table["direction"]], axis=1).astype(np.float64)
+    areas = np.zeros(len(table))
     has_size = table["kind"] == types.EMITTER_TRIANGLE
     triangles = table["triangle"][has_size]
     points = data.geometry.points.numpy()[data.geometry.indices.numpy()[triangles]].astype(np.float64)
-    centers[has_size] = points.mean(axis=1)
+    places[has_size] = np.concatenate([points.mean(axis=1), points[:, 0]], axis=1)
     areas[has_size] = np.linalg.norm(np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]), axis=1) / 2
-    two_sided = data.materials.numpy()["double_sided"][data.geometry.materials.numpy()[triangles]]
-    sides[has_size] = 1.0 + two_sided
-    return centers, areas, sides
-
-
-def _distances(points: np.ndarray, others: Any) -> np.ndarray:
-    return np.linalg.norm(points - np.asarray(others, np.float64), axis=1)
+    areas[has_size] *= 1.0 + data.materials.numpy()["double_sided"][data.geometry.materials.numpy()[triangles]]
+    return places, areas
