@@ -217,6 +217,11 @@ def rank_lights(
     for i in range(begin, begin + count):
         importances[i] = region_importance(cache, joined.entries[i] >> 8, center, cell[3])
     total = float(0.0)
+    if count <= capacity:  # all of them
+        for i in range(begin, begin + count):
+            total += importances[i]
+            importances[i] = MAIN
+        count = 0
     for _k in range(wp.min(capacity, count)):
         best = begin
         for i in range(begin, begin + count):

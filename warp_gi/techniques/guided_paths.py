@@ -95,7 +95,7 @@ class GuidedPaths(BsdfPaths):
         guides = _guides(lesson.octree.leaf_count, self.bits, device)
         uniform = wp.vec4ui(*quadtree.quadtree_uniform(self.bits))
         inputs = [lesson.origins, state.guides, guides, uniform, self.bsdf_share]
-        lesson.launch(guided_shares.take_over_guides, inputs, 256)
+        lesson.launch(guided_shares.take_over_guides, inputs)
         samples = lesson.leaf_samples(self.samples)
         if self.adapts_share:
             lesson.launch(guided_shares.adapt_shares, [samples, lesson.records, guides, self.bsdf_share])

@@ -14,6 +14,7 @@ from warp_gi.kernels import gbuffer, octree, samples
 from warp_gi.kernels.light_cache_build import LeafSamples
 
 MOST_SAMPLES = 1 << 28
+SLICES_PER_THREAD = 4
 MOST_CELLS = 1 << 24  # offsets of inner nodes have 24 bits
 
 
@@ -148,9 +149,11 @@ class Lesson:
     """int32 [leaf] whose knowledge it takes over; -1: the place holds no leaf."""
     device: wp.Device
 
-    def launch(self, kernel: wp.Kernel, inputs: list[Any], smallest_slice: int = 16) -> None:
-        """Run a kernel over all leaves."""
-        launch.launch(kernel, self.octree.leaf_count, inputs, self.device, smallest_slice)
+    def launch(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
+        """Run a kernel over all leaves, in few slices: kernels are many, and a slice costs tens of microseconds."""
+        leaves = self.octree.leaf_count
+        smallest_slice = max(16, -(-leaves // (SLICES_PER_THREAD * launch.thread_count())))
+        launch.launch(kernel, leaves, inputs, self.device, smallest_slice)
 
     def leaf_samples(self, most: int) -> LeafSamples:
         """Return the samples by leaf, of which ``most`` are looked at in one."""
