@@ -6,7 +6,7 @@ from warp_gi.kernels.bsdf import average_fresnel
 from warp_gi.kernels.bvh import bvh_intersect
 from warp_gi.kernels.environment import environment_radiance
 from warp_gi.kernels.sampling import filter_offset, pixel_sample_index, pixel_seed, sample_2d
-from warp_gi.kernels.surface import Surface, surface_at, surface_emission
+from warp_gi.kernels.surface import Surface, shading_normal, surface_at, surface_emission
 from warp_gi.kernels.types import Geometry, SceneData
 
 wp.set_module_options({"enable_backward": False})
@@ -145,7 +145,7 @@ def add_guides(
     motion: wp.vec2,
     object_id: wp.int32,
 ):
-    normal = wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
+    normal = shading_normal(s)
     buffers.guide_diffuse[pixel] = buffers.guide_diffuse[pixel] + s.bsdf.diffuse
     buffers.guide_specular[pixel] = buffers.guide_specular[pixel] + average_fresnel(s.bsdf)
     if buffers.guide_object[pixel] == 0:
@@ -187,7 +187,7 @@ def shade_primary(
         s = surface_at(scene, face, u, v, -direction)
         buffers.emission[pixel] = buffers.emission[pixel] + surface_emission(scene, face, u, v, -direction)
         buffers.albedo[pixel] = buffers.albedo[pixel] + s.base_color
-        buffers.normal[pixel] = buffers.normal[pixel] + wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
+        buffers.normal[pixel] = buffers.normal[pixel] + shading_normal(s)
         was = previous_position(scene.geometry, face, u, v)
         motion = project(previous_camera, was - previous_camera.position) - project(camera, direction)
         position = s.position

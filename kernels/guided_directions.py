@@ -9,7 +9,7 @@ import warp as wp
 from warp_gi.kernels.bsdf import Bsdf, average_reflectance, bsdf_evaluate, bsdf_sample
 from warp_gi.kernels.path_samplers import DirectionSample, DirectionSampler
 from warp_gi.kernels.quadtree import quadtree_pdf, quadtree_sample_leaf, quadtree_sample_warp
-from warp_gi.kernels.samples import GLOSSY_ALPHA
+from warp_gi.kernels.samples import is_glossy
 from warp_gi.kernels.sampling import random_1d, sample_1d, sample_2d
 from warp_gi.kernels.surface import Surface
 
@@ -28,7 +28,7 @@ class GuidedDirections:
 @wp.func
 def bsdf_share(data: GuidedDirections, region: wp.int32, b: Bsdf) -> wp.float32:
     shares = data.shares[region]
-    if b.f90 > 0.0 and b.alpha < GLOSSY_ALPHA:
+    if is_glossy(b):
         return shares[1]
     return shares[0]
 

@@ -7,9 +7,9 @@ samples, and the one with the least sum is taken. Sums of earlier frames fade.
 
 import warp as wp
 
-from warp_gi.kernels.light_cache_build import LeafSamples
 from warp_gi.kernels.quadtree_adapt import LARGEST_CONTRIBUTION
-from warp_gi.kernels.samples import SURFACE_GLOSSY, SampleRecords, mixture_densities
+from warp_gi.kernels.samples import SURFACE_GLOSSY, LeafSamples, SampleRecords, mixture_densities
+from warp_gi.kernels.sampling import spread_place
 
 wp.set_module_options({"enable_backward": False})
 
@@ -97,8 +97,7 @@ def adapt_shares(
     glossy = guides.moments[2 * leaf + 1] * FADING
     looks = wp.min(count, samples.most)
     for k in range(looks):
-        i = wp.int32(wp.int64(k) * wp.int64(count) / wp.int64(looks))
-        slot = samples.order[samples.starts[leaf] + i]
+        slot = samples.order[samples.starts[leaf] + spread_place(k, looks, count)]
         contribution = records.contributions[slot]
         if contribution > 0.0 and contribution < LARGEST_CONTRIBUTION:
             densities = mixture_densities(records.mixtures[slot])

@@ -13,7 +13,8 @@ from warp_gi.kernels.bsdf import luminance
 from warp_gi.kernels.light_cache import EXPLORATIONS, MOST_BUCKETS, CacheTables, ExplorationMoments, LightCache
 from warp_gi.kernels.octree import NEIGHBOURS, Octree, OctreeNodes, leaf_cell
 from warp_gi.kernels.quadtree_adapt import LARGEST_CONTRIBUTION
-from warp_gi.kernels.samples import LIGHT_ITEM, LIGHT_VISIBLE, SampleRecords, mixture_densities
+from warp_gi.kernels.samples import LIGHT_ITEM, LIGHT_VISIBLE, LeafSamples, SampleRecords, mixture_densities
+from warp_gi.kernels.sampling import spread_place
 from warp_gi.kernels.types import EMITTER_DIRECTIONAL, EMITTER_TRIANGLE
 
 wp.set_module_options({"enable_backward": False})
@@ -23,15 +24,6 @@ FREE = wp.constant(-1)
 LISTS = 8  # that are joined: a region's own, its neighbours', and what it knew
 ListEnds = wp.types.vector(length=LISTS, dtype=wp.int32)
 LATEST = wp.constant(0x7FFFFFFF)
-
-
-# Samples by leaf.
-@wp.struct
-class LeafSamples:
-    starts: wp.array(dtype=wp.int32)  # [leaf] first in `order`
-    counts: wp.array(dtype=wp.int32)  # [leaf]
-    order: wp.array(dtype=wp.int32)  # slots, leaf by leaf
-    most: wp.int32  # samples that are looked at in one leaf, evenly spread
 
 
 # Lists of lights by leaf.
@@ -46,7 +38,6 @@ class LightLists:
 class CacheSettings:
     capacity: wp.int32  # lights a bucket
     hysteresis: wp.float32  # share of the capacity that must suffice for fewer buckets than before
-    memory: wp.int32  # frames that a light stays after it was last seen
 
 
 # Ascending order, by Shell's method.
@@ -82,8 +73,7 @@ def list_seen_lights(first: wp.int32, samples: LeafSamples, lights: wp.array(dty
     looks = wp.min(count, samples.most)
     found = int(0)
     for k in range(looks):
-        i = wp.int32(wp.int64(k) * wp.int64(count) / wp.int64(looks))
-        word = lights[samples.order[samples.starts[leaf] + i]]
+        word = lights[samples.order[samples.starts[leaf] + spread_place(k, looks, count)]]
         if (word & LIGHT_VISIBLE) != wp.uint32(0) and found < MOST_LISTED:
             entry = (wp.int32(word & LIGHT_ITEM) - 1) << 8
             place = wp.int32((wp.uint32(entry) * wp.uint32(0x9E3779B1)) >> wp.uint32(12)) & (size - 1)
@@ -373,8 +363,7 @@ def adapt_exploration(
         moments = moments * FADING
         looks = wp.min(count, samples.most)
         for k in range(looks):
-            i = wp.int32(wp.int64(k) * wp.int64(count) / wp.int64(looks))
-            slot = samples.order[samples.starts[leaf] + i]
+            slot = samples.order[samples.starts[leaf] + spread_place(k, looks, count)]
             if (records.lights[slot] & LIGHT_VISIBLE) != wp.uint32(0):
                 word = records.light_mixtures[slot]
                 value = records.light_values[slot]

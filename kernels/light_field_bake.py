@@ -28,7 +28,7 @@ from warp_gi.kernels.light_field_place import PROBE_FACTOR, sees_back
 from warp_gi.kernels.octahedral import octahedral_decode, octahedral_wrap
 from warp_gi.kernels.path_trace import TERM_EMITTERS, TERM_ENVIRONMENT, PathSamplers, PathSettings, trace_path
 from warp_gi.kernels.sampling import hash_uint, morton_code, sample_2d
-from warp_gi.kernels.surface import surface_emission, surface_shape, with_color
+from warp_gi.kernels.surface import shading_normal, surface_emission, surface_shape, with_color
 from warp_gi.kernels.types import SceneData
 
 wp.set_module_options({"enable_backward": False})
@@ -89,7 +89,7 @@ def sample_texel(
     if hit.face < 0:
         return r
     s = with_color(scene, surface_shape(scene, hit.face, hit.u, hit.v, -direction))
-    r.normal = wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
+    r.normal = shading_normal(s)
     r.albedo = average_reflectance(s.bsdf)
     s.bsdf = lambert(r.albedo)
     paths = PathSettings()

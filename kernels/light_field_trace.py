@@ -20,7 +20,7 @@ from warp_gi.kernels.light_field import (
 from warp_gi.kernels.light_field_march import MISS, march
 from warp_gi.kernels.octahedral import octahedral_encode, octahedral_texel
 from warp_gi.kernels.sampling import pixel_sample_index, pixel_seed, sample_1d, sample_2d
-from warp_gi.kernels.surface import Surface, ray_origin, surface_at
+from warp_gi.kernels.surface import Surface, ray_origin, shading_normal, surface_at
 from warp_gi.kernels.types import SceneData
 
 wp.set_module_options({"enable_backward": False})
@@ -88,7 +88,7 @@ def steady_light(field: LightField, s: Surface, mode: wp.int32) -> Lobes:
     r = Lobes()
     if mode == MODE_TRACED or (mode == MODE_HYBRID and wp.max(s.bsdf.diffuse) <= 0.0):
         return r
-    normal = wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
+    normal = shading_normal(s)
     arriving = irradiance_at(field, s.position, normal) / wp.pi
     f = average_fresnel(s.bsdf)
     r.diffuse = wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - f, arriving)

@@ -25,6 +25,7 @@ from warp_gi.kernels.quadtree import (
     quadtree_level_start,
     quadtree_migrated_children,
 )
+from warp_gi.kernels.sampling import spread_place
 
 wp.set_module_options({"enable_backward": False})
 
@@ -91,10 +92,7 @@ def add_energies(samples: QuadtreeSamples, adaptation: QuadtreeAdaptation, item:
         adaptation.energies[i] = adaptation.energies[i] * (1.0 - weight)
     weight = weight / wp.float32(taken)
     for i in range(taken):
-        place = i
-        if taken < count:
-            place = wp.int32(wp.int64(i) * wp.int64(count) / wp.int64(taken))
-        record = samples.order[samples.starts[item] + place]
+        record = samples.order[samples.starts[item] + spread_place(i, taken, count)]
         contribution = samples.contributions[record]
         if contribution >= 0.0 and contribution < LARGEST_CONTRIBUTION:
             code = samples.directions[record]

@@ -6,6 +6,7 @@ beyond what the buffers are for, one in `stride` is recorded, whichever a hash s
 
 import warp as wp
 
+from warp_gi.kernels.bsdf import Bsdf
 from warp_gi.kernels.emitters import LightChoice
 from warp_gi.kernels.gbuffer import previous_position
 from warp_gi.kernels.octree import EMPTY_CODE, Octree, cell_code, octree_leaf
@@ -22,6 +23,12 @@ SURFACE_GLOSSY = wp.constant(wp.uint32(1 << 29))
 LIGHT_ITEM = wp.constant(wp.uint32((1 << 28) - 1))  # emitter + 1; 0: none was sampled
 GLOSSY_ALPHA = wp.constant(wp.float32(0.2))  # GGX alpha below which a surface counts as glossy
 NO_DIRECTION = wp.constant(wp.float32(-1.0))
+
+
+# Which of the two kinds of surfaces of a region, that learn a share of the BSDF each.
+@wp.func
+def is_glossy(b: Bsdf) -> wp.bool:
+    return b.f90 > 0.0 and b.alpha < GLOSSY_ALPHA
 
 
 # Share of one of two strategies in the density of a sample, and the share with which it is asked, 16 bits each.
@@ -53,6 +60,15 @@ class SampleRecords:
     vertices: wp.int32  # slots of a path
     stride: wp.int32
     seed: wp.uint32
+
+
+# Samples by leaf.
+@wp.struct
+class LeafSamples:
+    starts: wp.array(dtype=wp.int32)  # [leaf] first in `order`
+    counts: wp.array(dtype=wp.int32)  # [leaf]
+    order: wp.array(dtype=wp.int32)  # slots, leaf by leaf
+    most: wp.int32  # samples that are looked at in one leaf, evenly spread
 
 
 @wp.struct
@@ -94,7 +110,7 @@ def sample_vertex(data: SampleRegions, slot: wp.int32, vertex: wp.int32) -> wp.i
 def keep_vertex(data: SampleRegions, slot: wp.int32, s: Surface):
     data.records.codes[slot] = cell_code(data.octree, s.position)
     flags = wp.uint32(0)
-    if s.bsdf.f90 > 0.0 and s.bsdf.alpha < GLOSSY_ALPHA:
+    if is_glossy(s.bsdf):
         flags = SURFACE_GLOSSY
     data.records.lights[slot] = flags
     data.records.contributions[slot] = NO_DIRECTION

@@ -172,6 +172,12 @@ def frame_of(n: wp.vec3) -> wp.mat33:
     return wp.matrix_from_cols(s, t, n)
 
 
+# Number k of `looks` places that are spread evenly over `count`, of which there are no fewer.
+@wp.func
+def spread_place(k: wp.int32, looks: wp.int32, count: wp.int32) -> wp.int32:
+    return wp.int32(wp.int64(k) * wp.int64(count) / wp.int64(looks))
+
+
 # Balance heuristic for one sample of each of two strategies.
 @wp.func
 def balance(pdf: wp.float32, other_pdf: wp.float32) -> wp.float32:

@@ -19,7 +19,7 @@ from warp_gi.kernels.environment import environment_lookup, environment_radiance
 from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, tiled_pixel
 from warp_gi.kernels.harmonics import Harmonics, cosine_harmonics, harmonics, vec9
 from warp_gi.kernels.sampling import morton_code, pixel_sample_index, pixel_seed, random_1d, sample_2d
-from warp_gi.kernels.surface import Surface, ray_origin, surface_shape, with_color
+from warp_gi.kernels.surface import Surface, ray_origin, shading_normal, surface_shape, with_color
 from warp_gi.kernels.types import SceneData
 from warp_gi.kernels.visibility_field import (
     MODE_PAPER,
@@ -255,7 +255,7 @@ def lambert_samples(
 ) -> FieldSums:
     sums = FieldSums()
     t = vec9()
-    normal = wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
+    normal = shading_normal(s)
     subtracts = query.mode == MODE_PAPER and p.slot >= 0 and (p.slot & SLOT_LABEL) == 0  # Eq. 11
     frame = turned_frame(s.shading, p.turn)
     for done in range(0, p.count, 8):
@@ -368,7 +368,7 @@ def light_samples(
     sums: FieldSums,
 ) -> FieldSums:
     r = sums
-    normal = wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
+    normal = shading_normal(s)
     chosen = wp.int32(random_1d(wp.uint32(0), p.seed, SET_DIMENSION) * wp.float32(sky.set_count))
     for i in range(p.first, p.first + p.count):
         k = (chosen + i / sky.set_size) % sky.set_count * sky.set_size + i % sky.set_size

@@ -18,7 +18,6 @@ from statistics_tools import (  # noqa: F401
 
 from warp_gi.kernels import guided_directions, guided_shares, quadtree, quadtree_adapt, samples
 from warp_gi.kernels.bsdf import average_reflectance, bsdf_evaluate, make_bsdf
-from warp_gi.kernels.light_cache_build import LeafSamples
 from warp_gi.kernels.path_samplers import sample_weight
 from warp_gi.kernels.sampling import frame_of
 from warp_gi.kernels.surface import Surface
@@ -330,7 +329,7 @@ class Records:
         return out
 
     def on_device(self, most):
-        grouped, records = LeafSamples(), samples.SampleRecords()
+        grouped, records = samples.LeafSamples(), samples.SampleRecords()
         grouped.starts, grouped.counts = on_device(self.starts, wp.int32), on_device(self.lengths, wp.int32)
         grouped.order, grouped.most = on_device(self.order, wp.int32), most
         records.contributions = on_device(self.contributions, wp.float32)

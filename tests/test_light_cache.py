@@ -826,7 +826,7 @@ def words(emitters, visible, rng):
 
 
 def leaf_samples(counts, order, most):
-    grouped = light_cache_build.LeafSamples()
+    grouped = samples.LeafSamples()
     grouped.starts, grouped.counts = array(np.cumsum(counts) - counts), array(counts)
     grouped.order, grouped.most = array(order), most
     return grouped
@@ -1075,9 +1075,9 @@ def test_lights_that_matter_most(capacity):
 # ---- buckets ----
 
 
-def settings_of(capacity=32, memory=4, hysteresis=0.75):
+def settings_of(capacity=32, hysteresis=0.75):
     s = light_cache_build.CacheSettings()
-    s.capacity, s.memory, s.hysteresis = capacity, memory, hysteresis
+    s.capacity, s.hysteresis = capacity, hysteresis
     return s
 
 

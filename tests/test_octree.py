@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
@@ -510,9 +511,8 @@ def test_origin_of_a_collapsed_cell_is_the_fullest():
 
 
 def opened(resolution, spp, vertices, most, seed=5, previous=None):
-    frame = SimpleNamespace(
-        camera=SimpleNamespace(resolution=resolution), pipeline=SimpleNamespace(spp=spp), device=device(), seed=seed
-    )
+    items = math.prod(8 * math.ceil(size / 8) for size in resolution)
+    frame = SimpleNamespace(tiled_items=items, pipeline=SimpleNamespace(spp=spp), device=device(), seed=seed)
     return gi.SampleOctree(most_samples=most).records(frame, vertices, previous)
 
 

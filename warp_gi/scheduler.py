@@ -184,10 +184,15 @@ class Frame:
         width, height = self.camera.resolution
         launch.launch(kernel, width * height if count is None else count, inputs, self.device)
 
+    @property
+    def tiled_items(self) -> int:
+        """Items of a launch in tiles: those of pixels, and of what tiles at the border have besides."""
+        tiles = [math.ceil(size / gbuffer.TILE) for size in self.camera.resolution]
+        return tiles[0] * tiles[1] * gbuffer.TILE**2
+
     def launch_tiled(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
         """Run a kernel over every pixel in tiles (``kernels.gbuffer.tiled_pixel``)."""
-        tiles = [math.ceil(size / gbuffer.TILE) for size in self.camera.resolution]
-        self.launch(kernel, inputs, tiles[0] * tiles[1] * gbuffer.TILE**2)
+        self.launch(kernel, inputs, self.tiled_items)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

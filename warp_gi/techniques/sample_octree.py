@@ -10,8 +10,7 @@ import warp as wp
 
 from warp_gi import launch
 from warp_gi.errors import OptionError, check_whole
-from warp_gi.kernels import gbuffer, octree, samples
-from warp_gi.kernels.light_cache_build import LeafSamples
+from warp_gi.kernels import octree, samples
 
 MOST_SAMPLES = 1 << 28
 SLICES_PER_THREAD = 4
@@ -52,8 +51,7 @@ class SampleOctree:
 
     def records(self, frame: Any, vertices: int, previous: samples.SampleRecords | None) -> samples.SampleRecords:
         """Return empty buffers for the samples of a frame whose paths have ``vertices``; uses ``previous`` again."""
-        tiles = [-(-size // gbuffer.TILE) for size in frame.camera.resolution]
-        paths = tiles[0] * tiles[1] * gbuffer.TILE**2 * frame.pipeline.spp
+        paths = frame.tiled_items * frame.pipeline.spp
         stride = max(1, -(-paths * vertices // self.most_samples))
         slots = -(-paths // stride) * vertices
         records = samples.SampleRecords()
@@ -80,7 +78,7 @@ class SampleOctree:
         launch.launch(octree.find_origins, leaves, [tree, state.octree.nodes, codes, origins, counts], device)
         cube = launch.copied(state.octree, octree.Octree)
         cube.nodes = tree.nodes
-        grouped = LeafSamples()
+        grouped = samples.LeafSamples()
         grouped.starts, grouped.counts, grouped.order = tree.starts, counts, slots
         grown = OctreeState(cube, tree.prefixes, tree.levels, tree.counts)
         return Lesson(grown, tree, records, grouped, neighbours, origins, device)
@@ -141,7 +139,7 @@ class Lesson:
     octree: OctreeState
     tree: octree.OctreeNodes
     records: samples.SampleRecords
-    samples: LeafSamples
+    samples: samples.LeafSamples
     """``most`` is for each technique to set."""
     neighbours: wp.array
     """int32 [6 leaf + face]"""
@@ -155,9 +153,9 @@ class Lesson:
         smallest_slice = max(16, -(-leaves // (SLICES_PER_THREAD * launch.thread_count())))
         launch.launch(kernel, leaves, inputs, self.device, smallest_slice)
 
-    def leaf_samples(self, most: int) -> LeafSamples:
+    def leaf_samples(self, most: int) -> samples.LeafSamples:
         """Return the samples by leaf, of which ``most`` are looked at in one."""
-        grouped = launch.copied(self.samples, LeafSamples)
+        grouped = launch.copied(self.samples, samples.LeafSamples)
         grouped.most = most
         return grouped
 

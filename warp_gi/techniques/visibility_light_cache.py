@@ -146,7 +146,7 @@ class VisibilityLightCache(Estimator):
             return None
         device, leaves = lesson.device, lesson.octree.leaf_count
         settings = light_cache_build.CacheSettings()
-        settings.capacity, settings.memory = self.capacity, self.memory
+        settings.capacity = self.capacity
         settings.hysteresis = 0.75
         samples, origins = lesson.leaf_samples(self.samples), lesson.origins
 
