@@ -24,6 +24,8 @@ from warp_gi.files import replacing
 
 FOLDER = Path(__file__).parent
 PACKAGES = ("warp-lang", "numpy", "mitsuba", "embreex")
+ENVIRONMENT = ("quick", "commit", "warp_gi", "python", *PACKAGES, "cpu", "cores", "threads", "device")
+"""Keys of a line of results that say how it was measured."""
 
 
 def suites(folder: Path = FOLDER) -> dict[str, str]:
@@ -54,9 +56,14 @@ def print_rows(title: str, rows: Sequence[dict[str, Any]]) -> None:
 
 
 def json_lines(suite: str, rows: Sequence[dict[str, Any]], quick: bool, device: str) -> str:
-    """Return each row as a line of JSON, with what is needed to repeat it."""
+    """Return each row as a line of JSON, with what is needed to repeat it; ``records.read`` reads them."""
+    return "".join(json.dumps(row, default=float) + "\n" for row in stamped(suite, rows, quick, device))
+
+
+def stamped(suite: str, rows: Sequence[dict[str, Any]], quick: bool, device: str) -> list[dict[str, Any]]:
+    """Return rows with the suite and the environment that they were measured in."""
     common = {"suite": suite, "quick": quick, **environment(device)}
-    return "".join(json.dumps({**common, **row}, default=float) + "\n" for row in rows)
+    return [{**common, **row} for row in rows]
 
 
 def write_json_lines(path: Path, suite: str, rows: Sequence[dict[str, Any]], quick: bool, device: str) -> None:

@@ -1,4 +1,4 @@
-"""``warp-gi bench``: the suites of ``bench/``."""
+"""``warp-gi bench``: the suites of ``bench/``, reports of their results, and what changed between two of them."""
 
 from __future__ import annotations
 
@@ -10,14 +10,19 @@ from typing import Annotated
 import tyro
 
 from warp_gi import launch
-from warp_gi.bench import runner
-from warp_gi.cli_options import parse_options
+from warp_gi.bench import diff, records, runner
+from warp_gi.cli_options import flag, parse_options
 from warp_gi.cli_report import print_table, start_warp
+from warp_gi.errors import OptionError
+from warp_gi.files import check_writable
 
 
 @dataclass
 class Bench:
-    """Run a benchmark suite and print its tables. Without SUITE, list the suites."""
+    """Run a benchmark suite and print its tables. Without SUITE, list the suites.
+
+    --report makes a report of results files, and --diff compares two of them; neither runs anything.
+    """
 
     suite: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SUITE", help_behavior_hint="")] = ""
     """Name of a module in bench/."""
@@ -25,6 +30,14 @@ class Bench:
     """Smaller inputs, for a first look; not for figures that anyone quotes."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
     """Also write each row as a line of JSON, with commit, versions, processor and settings; - prints the lines."""
+    html: Annotated[Path | None, flag("FILE", "none")] = None
+    """Also write tables and plots as one HTML file that needs no network."""
+    report: Annotated[tuple[Path, ...], flag("RESULTS...", "none")] = ()
+    """Results files that --json wrote, to make the --html report of."""
+    diff: Annotated[tuple[Path, Path] | None, flag("OLD NEW", "none")] = None
+    """Two results files: print what became worse or better beyond the spread. Exit code 1 if anything is worse."""
+    tolerance: Annotated[float | None, flag("SHARE", "0.15 for times, 0.05 for errors")] = None
+    """For --diff: the share that values may change by where their spread is not known."""
     device: str = "cpu"
     """cpu, cuda or cuda:1."""
     threads: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: every core)")] = None
@@ -34,12 +47,39 @@ class Bench:
 def main(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse_options(Bench, "bench", arguments)
-    if not options.suite:
+    _check(options)
+    if options.diff is not None:
+        return diff.diff_files(*options.diff, options.tolerance)
+    if options.report:
+        _write_html(options.html, records.read(options.report))
+    elif options.suite:
+        _run(options)
+    else:
         print_table("suites", ("name", "what it measures"), sorted(runner.suites().items()))
-        return 0
+    return 0
+
+
+def _check(options: Bench) -> None:
+    if options.diff is not None and (options.suite or options.report or options.html or options.json):
+        raise OptionError("--diff compares two files and goes with --tolerance alone")
+    if options.diff is None and options.tolerance is not None:
+        raise OptionError("--tolerance is for --diff OLD NEW")
+    if options.report and (options.suite or options.json):
+        raise OptionError("--report runs nothing: give it results files and --html FILE, without SUITE or --json")
+    if options.report and options.html is None:
+        raise OptionError("--report needs --html FILE, to write the report to")
+    if (options.html or options.json) and not (options.suite or options.report):
+        raise OptionError("nothing to write: give a SUITE to run, or --report RESULTS... with --html FILE")
+    if options.html is not None and options.html.is_dir():
+        raise OptionError(f"--html {options.html}: is a folder; give a file")
+
+
+def _run(options: Bench) -> None:
     start_warp(options.device)
     if options.threads is not None:
         launch.set_threads(options.threads)
+    if options.html is not None and options.suite in runner.suites():
+        check_writable(options.html.absolute().parent)
     rows = runner.run_suite(options.suite, options.quick, options.device)
     runner.print_rows(options.suite, rows)
     if options.json == Path("-"):
@@ -47,4 +87,17 @@ def main(arguments: Sequence[str]) -> int:
     elif options.json is not None:
         runner.write_json_lines(options.json, options.suite, rows, options.quick, options.device)
         print(f"rows: {options.json}")
-    return 0
+    if options.html is not None:
+        _write_html(options.html, runner.stamped(options.suite, rows, options.quick, options.device))
+
+
+def _write_html(path: Path, rows: list[records.Row]) -> None:
+    from warp_gi.bench import report, report_plots
+
+    by_suite: dict[str, list[records.Row]] = {}
+    for row in rows:
+        by_suite.setdefault(str(row.get("suite", "")), []).append(row)
+    plots = [plot for suite, group in by_suite.items() for plot in report_plots.plots_of(suite, group)]
+    suites = ", ".join(filter(None, by_suite))
+    report.write_report(path, f"warp_gi: {suites}" if suites else "warp_gi", rows, plots=plots)
+    print(f"report: {path}")

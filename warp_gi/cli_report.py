@@ -158,7 +158,7 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]
     from rich.console import Console
     from rich.table import Table
 
-    rows = [[_cell(value) for value in row] for row in rows]
+    rows = [[cell_text(value) for value in row] for row in rows]
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for index, column in enumerate(columns):
         numeric = any(_is_number(row[index]) for row in rows)
@@ -188,7 +188,8 @@ def start_warp(device: str = "cpu") -> None:
     launch.get_device(device)
 
 
-def _cell(value: Any) -> str:
+def cell_text(value: Any) -> str:
+    """Return a value as tables show it: four digits, thousands parted, None as nothing."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int):
