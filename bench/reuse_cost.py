@@ -41,7 +41,7 @@ def pipelines() -> dict[str, gi.Pipeline]:
 
 def cost_rows(quick: bool, device: str) -> list[Row]:
     """Return passes, overheads and memory of the warehouse and the mine, and the paper's."""
-    size, frames, first = ((160, 90), 10, 5) if quick else ((320, 180), 24, 12)
+    size, frames, first = ((160, 90), 10, 5) if quick else ((640, 360), 14, 7)
     rows: list[Row] = []
     for place in (WAREHOUSE,) if quick else (WAREHOUSE, MINE):
         rows += place_cost(place, size, frames, first, device)

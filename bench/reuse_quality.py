@@ -63,7 +63,7 @@ def pipelines(**settings: Any) -> dict[str, gi.Pipeline]:
 
 def quality_rows(quick: bool, device: str) -> list[Row]:
     """Return rows of all combinations, of the targets, and what the paper says."""
-    size, spp, frames, settled = ((120, 68), 48, 14, 8) if quick else ((240, 135), 192, 40, 24)
+    size, spp, frames, settled = ((120, 68), 48, 14, 8) if quick else ((480, 270), 128, 30, 18)
     rows: list[Row] = []
     for place in QUICK_PLACES if quick else PLACES:
         if place.missing:

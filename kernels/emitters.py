@@ -23,9 +23,9 @@ INFINITE_DISTANCE = wp.constant(wp.float32(1.0e30))
 @wp.struct
 class LightChoice:
     item: wp.int32  # -1: none
-    pdf: wp.float32  # probability of selecting it
-    explores: wp.float32  # share of samples that explore, of one who does
-    by_exploring: wp.float32  # probability that such a sample, selecting this emitter, explored
+    pdf: wp.float32  # expected number of times that it is selected: a probability, where one choice is made
+    weight: wp.float32  # factor of what it brings; 1, where one choice is made
+    explores: wp.int32  # 1: found by exploring, beside what a cache offers
 
 
 # radiance is over pdf already for lights without size (delta = 1), whose pdf is the

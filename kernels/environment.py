@@ -1,13 +1,15 @@
 """The sky: radiance in a direction, sampling directions by it, and the pdf of doing so.
 
 A map's texel (row i, column j) is a node at v = i / (height - 1), u = (j + 0.5) / width, and radiance
-is bilinear between nodes; the first row is the zenith, the last the nadir. Sampling picks the cell around
-a node (half way to its neighbours, so half a cell high at the poles) and is uniform in solid angle in it.
+is bilinear between nodes; the first row is the zenith, the last the nadir. Sampling picks a patch between four
+nodes, then a point in it by the luminance there. So the density per latitude and longitude is the luminance, times
+the sine of the polar angle in the middle of the patch; only that sine, and colours, make samples differ in weight.
 """
 
 import warp as wp
 
 from warp_gi.kernels.alias import alias_choice, alias_prefetch
+from warp_gi.kernels.bsdf import luminance
 from warp_gi.kernels.sampling import circle
 from warp_gi.kernels.types import ENVIRONMENT_CONSTANT, ENVIRONMENT_MAP, Environment
 
@@ -22,6 +24,7 @@ UNIFORM_SPHERE_PDF = wp.constant(wp.float32(0.07957747154594767))  # 1 / (4 pi)
 class EnvironmentSample:
     direction: wp.vec3  # unit, world space, towards the sky
     pdf: wp.float32  # 1/sr; 0 if there is nothing to sample
+    radiance: wp.vec3  # W/(m^2 sr)
 
 
 @wp.struct
@@ -48,14 +51,23 @@ def lat_long_decode(uv: wp.vec2) -> wp.vec3:
     return wp.vec3(sin_theta * wp.sin(phi), wp.cos(theta), -sin_theta * wp.cos(phi))
 
 
+# Four nodes of the map around a point, in units of its texels, and where between them it is.
+@wp.struct
+class Patch:
+    row: wp.int32
+    s: wp.float32  # from left to right
+    t: wp.float32  # from upper to lower
+    upper_left: wp.vec3
+    upper_right: wp.vec3
+    lower_left: wp.vec3
+    lower_right: wp.vec3
+
+
+# The patch whose left nodes stand in a column, which may be -1.
 @wp.func
-def bilinear_radiance(env: Environment, uv: wp.vec2) -> wp.vec3:
-    x = wp.clamp(uv[0], 0.0, 1.0) * wp.float32(env.width) - 0.5
-    y = wp.clamp(uv[1], 0.0, 1.0) * wp.float32(env.height - 1)
-    column = wp.int32(wp.floor(x))
-    row = wp.clamp(wp.int32(y), 0, env.height - 2)
-    s = x - wp.float32(column)
-    t = y - wp.float32(row)
+def patch_nodes(env: Environment, row: wp.int32, column: wp.int32) -> Patch:
+    r = Patch()
+    r.row = row
     left = column
     if left < 0:
         left += env.width
@@ -63,104 +75,111 @@ def bilinear_radiance(env: Environment, uv: wp.vec2) -> wp.vec3:
     if right >= env.width:
         right -= env.width
     start = row * env.width
-    upper = env.texels[start + left] * (1.0 - s) + env.texels[start + right] * s
-    start += env.width
-    lower = env.texels[start + left] * (1.0 - s) + env.texels[start + right] * s
-    return wp.cw_mul(upper * (1.0 - t) + lower * t, env.radiance)
+    r.upper_left = env.texels[start + left]
+    r.upper_right = env.texels[start + right]
+    r.lower_left = env.texels[start + env.width + left]
+    r.lower_right = env.texels[start + env.width + right]
+    return r
 
 
-# Polar angles where a row's cells begin and end.
 @wp.func
-def row_bounds(row: wp.int32, height: wp.int32) -> wp.vec2:
-    step = PI / wp.float32(height - 1)
-    return wp.vec2(
-        wp.max(wp.float32(row) - 0.5, 0.0) * step, wp.min(wp.float32(row) + 0.5, wp.float32(height - 1)) * step
-    )
+def patch_at(env: Environment, uv: wp.vec2) -> Patch:
+    x = wp.clamp(uv[0], 0.0, 1.0) * wp.float32(env.width) - 0.5
+    y = wp.clamp(uv[1], 0.0, 1.0) * wp.float32(env.height - 1)
+    column = wp.int32(wp.floor(x))
+    row = wp.clamp(wp.int32(y), 0, env.height - 2)
+    r = patch_nodes(env, row, column)
+    r.s = x - wp.float32(column)
+    r.t = y - wp.float32(row)
+    return r
 
 
-# Steradians of one cell of a row: 2 pi / width * (cos(begin) - cos(end)), without the cancellation.
 @wp.func
-def cell_solid_angle(bounds: wp.vec2, width: wp.int32) -> wp.float32:
-    middle = 0.5 * (bounds[0] + bounds[1])
-    half = 0.5 * (bounds[1] - bounds[0])
-    return 2.0 * TWO_PI / wp.float32(width) * wp.sin(middle) * wp.sin(half)
+def patch_texel(p: Patch) -> wp.vec3:
+    upper = p.upper_left * (1.0 - p.s) + p.upper_right * p.s
+    lower = p.lower_left * (1.0 - p.s) + p.lower_right * p.s
+    return upper * (1.0 - p.t) + lower * p.t
+
+
+# Sine of the polar angle of nodes at `row`, measured from the nearer pole.
+@wp.func
+def row_sine(row: wp.float32, height: wp.int32) -> wp.float32:
+    last = wp.float32(height - 1)
+    return circle(0.5 * wp.min(row, last - row) / last)[1]
+
+
+# Density [1/sr] of a direction that is `sine` away from the poles' axis, in a patch's row. `pdf_scale` is one over the
+# integral of luminance over latitude and longitude, times the sines in the middle of rows.
+@wp.func
+def patch_pdf(env: Environment, row: wp.int32, texel: wp.vec3, sine: wp.float32) -> wp.float32:
+    middle = row_sine(wp.float32(row) + 0.5, env.height)
+    return luminance(texel) * env.pdf_scale * middle / wp.max(sine, 1.0e-12)
 
 
 # Radiance [W/(m^2 sr)] from a unit direction in world space.
 @wp.func
 def environment_radiance(env: Environment, direction: wp.vec3) -> wp.vec3:
     if env.kind == ENVIRONMENT_MAP:
-        return bilinear_radiance(env, lat_long_encode(env.environment_from_world * direction))
+        texel = patch_texel(patch_at(env, lat_long_encode(env.environment_from_world * direction)))
+        return wp.cw_mul(texel, env.radiance)
     if env.kind == ENVIRONMENT_CONSTANT:
         return env.radiance
     return wp.vec3(0.0, 0.0, 0.0)
 
 
-# Probability density [1/sr] of the cell that holds latitude-longitude coordinates.
-@wp.func
-def cell_pdf(env: Environment, uv: wp.vec2) -> wp.float32:
-    column = wp.min(wp.int32(uv[0] * wp.float32(env.width)), env.width - 1)
-    row = wp.min(wp.int32(uv[1] * wp.float32(env.height - 1) + 0.5), env.height - 1)
-    return env.alias[row * env.width + column].pdf / cell_solid_angle(row_bounds(row, env.height), env.width)
-
-
-# Probability density [1/sr] with which environment_sample yields a unit direction in world space.
-@wp.func
-def environment_pdf(env: Environment, direction: wp.vec3) -> wp.float32:
-    if env.kind == ENVIRONMENT_MAP:
-        return cell_pdf(env, lat_long_encode(env.environment_from_world * direction))
-    if env.kind == ENVIRONMENT_CONSTANT:
-        return UNIFORM_SPHERE_PDF
-    return 0.0
-
-
-# Radiance and pdf of a direction at the cost of one.
+# Radiance from a unit direction in world space, and the density [1/sr] with which environment_sample yields it.
 @wp.func
 def environment_lookup(env: Environment, direction: wp.vec3) -> EnvironmentLookup:
     r = EnvironmentLookup()
     if env.kind == ENVIRONMENT_MAP:
-        uv = lat_long_encode(env.environment_from_world * direction)
-        r.radiance = bilinear_radiance(env, uv)
-        r.pdf = cell_pdf(env, uv)
-    else:
-        r.radiance = environment_radiance(env, direction)
-        r.pdf = environment_pdf(env, direction)
+        local = env.environment_from_world * direction
+        patch = patch_at(env, lat_long_encode(local))
+        texel = patch_texel(patch)
+        r.radiance = wp.cw_mul(texel, env.radiance)
+        r.pdf = patch_pdf(env, patch.row, texel, wp.sqrt(local[0] * local[0] + local[2] * local[2]))
+    elif env.kind == ENVIRONMENT_CONSTANT:
+        r.radiance = env.radiance
+        r.pdf = UNIFORM_SPHERE_PDF
     return r
 
 
-# A direction with a density close to the radiance from there (not looked up: most samples turn out to
-# be occluded, and each lookup in a map waits for memory), from three uniform numbers in [0, 1):
-# u[0] with further digits u[2] picks a cell and then the azimuth in it, u[1] the polar angle.
+# Where a density that goes from a to b, in a straight line over [0, 1], has the share u below.
+@wp.func
+def sample_linear(a: wp.float32, b: wp.float32, u: wp.float32) -> wp.float32:
+    root = wp.sqrt(wp.lerp(a * a, b * b, u))
+    return wp.min(u * (a + b) / wp.max(a + root, 1.0e-30), 1.0)
+
+
+# A direction by the luminance from there, from three uniform numbers in [0, 1): u[0] with further digits u[2] picks a
+# patch and then the azimuth in it, u[1] the polar angle.
 @wp.func
 def environment_sample(env: Environment, u: wp.vec3) -> EnvironmentSample:
     result = EnvironmentSample()
     if env.kind == ENVIRONMENT_MAP:
-        choice = alias_choice(env.alias, env.width * env.height, u[0], u[2])
+        choice = alias_choice(env.alias, env.width * (env.height - 1), u[0], u[2])
         row = choice.item / env.width
         column = choice.item - row * env.width
-        bounds = row_bounds(row, env.height)
-        # Uniform in cos(theta) = 1 - 2 sin^2(theta / 2); measured from the nearer pole to keep its precision.
-        below = bounds[0] + bounds[1] > PI
-        begin = bounds[0]
-        end = bounds[1]
-        if below:
-            begin = PI - bounds[0]
-            end = PI - bounds[1]
-        sin_begin = circle(begin / (2.0 * TWO_PI))[1]
-        sin_end = circle(end / (2.0 * TWO_PI))[1]
-        square = wp.lerp(sin_begin * sin_begin, sin_end * sin_end, u[1])
-        cos_theta = 1.0 - 2.0 * square
-        if below:
-            cos_theta = -cos_theta
-        around = circle((wp.float32(column) + choice.remainder) / wp.float32(env.width))
-        around = around * (2.0 * wp.sqrt(square * (1.0 - square)))
-        local = wp.vec3(around[1], cos_theta, -around[0])
+        patch = patch_nodes(env, row, column)
+        left = wp.vec2(luminance(patch.upper_left), luminance(patch.lower_left))
+        right = wp.vec2(luminance(patch.upper_right), luminance(patch.lower_right))
+        patch.t = sample_linear(left[0] + right[0], left[1] + right[1], u[1])
+        patch.s = sample_linear(
+            wp.lerp(left[0], left[1], patch.t), wp.lerp(right[0], right[1], patch.t), choice.remainder
+        )
+        texel = patch_texel(patch)
+        place = wp.float32(row) + patch.t
+        sine = row_sine(place, env.height)
+        cosine = circle(0.5 * place / wp.float32(env.height - 1))[0]
+        around = circle((wp.float32(column) + 0.5 + patch.s) / wp.float32(env.width)) * sine
+        local = wp.vec3(around[1], cosine, -around[0])
         result.direction = wp.transpose(env.environment_from_world) * local
-        result.pdf = choice.pdf / cell_solid_angle(bounds, env.width)
+        result.radiance = wp.cw_mul(texel, env.radiance)
+        result.pdf = patch_pdf(env, row, texel, sine)
     elif env.kind == ENVIRONMENT_CONSTANT:
         z = 1.0 - 2.0 * u[1]
         r = wp.sqrt(wp.max(0.0, 1.0 - z * z))
         result.direction = wp.vec3(r * wp.cos(TWO_PI * u[0]), z, r * wp.sin(TWO_PI * u[0]))
+        result.radiance = env.radiance
         result.pdf = UNIFORM_SPHERE_PDF
     return result
 
@@ -168,4 +187,4 @@ def environment_sample(env: Environment, u: wp.vec3) -> EnvironmentSample:
 # Starts fetching what environment_sample(env, u) will read first.
 @wp.func
 def environment_prefetch(env: Environment, u: wp.vec3):
-    alias_prefetch(env.alias, env.width * env.height, u[0])
+    alias_prefetch(env.alias, env.width * (env.height - 1), u[0])

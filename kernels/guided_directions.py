@@ -7,6 +7,7 @@ A share of directions, which each region learns for itself, comes from the BSDF;
 import warp as wp
 
 from warp_gi.kernels.bsdf import Bsdf, average_reflectance, bsdf_evaluate, bsdf_sample
+from warp_gi.kernels.parallax import seen_from_anchor, seen_from_point
 from warp_gi.kernels.path_samplers import DirectionSample, DirectionSampler
 from warp_gi.kernels.quadtree import quadtree_pdf, quadtree_sample_leaf, quadtree_sample_warp
 from warp_gi.kernels.samples import is_glossy
@@ -22,6 +23,7 @@ class GuidedDirections:
     stratified: wp.int32  # 1: warp two numbers, 0: pick a leaf by a third (the paper's way)
     trees: wp.array(dtype=wp.vec4ui)  # [leaf]
     counts: wp.array(dtype=wp.uint32)  # [leaf * bits / 4] quadtree_counts
+    anchors: wp.array(dtype=wp.vec4)  # [leaf] see parallax.py
     shares: wp.array(dtype=wp.vec2)  # [leaf] of the BSDF, for rough and for glossy surfaces
 
 
@@ -31,6 +33,13 @@ def bsdf_share(data: GuidedDirections, region: wp.int32, b: Bsdf) -> wp.float32:
     if is_glossy(b):
         return shares[1]
     return shares[0]
+
+
+# Density of the region's tree at a point, 1/sr.
+@wp.func
+def tree_pdf(data: GuidedDirections, region: wp.int32, s: Surface, wi: wp.vec3) -> wp.float32:
+    seen = seen_from_anchor(data.anchors[region], s.position, wi)
+    return quadtree_pdf(data.trees[region], data.bits, seen.direction) * seen.stretch
 
 
 @wp.func
@@ -56,17 +65,21 @@ def guided_direction(
         r.wi = s.shading * b.wi
         r.bsdf_pdf = b.pdf
         value = b.weight * b.pdf
-        guide_pdf = quadtree_pdf(data.trees[region], data.bits, r.wi)
+        guide_pdf = tree_pdf(data, region, s, r.wi)
     else:
+        tree_direction = wp.vec3()
         if data.stratified != 0:
             q = quadtree_sample_warp(data.trees[region], data.bits, data.counts, region * (data.bits / 4), u2)
-            r.wi = q.direction
+            tree_direction = q.direction
             guide_pdf = q.pdf
         else:
             u_leaf = random_1d(index, seed, dimension + 8192)
             q = quadtree_sample_leaf(data.trees[region], data.bits, u_leaf, u2)
-            r.wi = q.direction
+            tree_direction = q.direction
             guide_pdf = q.pdf
+        seen = seen_from_point(data.anchors[region], s.position, tree_direction)
+        r.wi = seen.direction
+        guide_pdf = guide_pdf * seen.stretch
         f = bsdf_evaluate(s.bsdf, wo, wp.transpose(s.shading) * r.wi)
         if f.pdf <= 0.0:
             return r
@@ -87,7 +100,7 @@ def guided_direction_pdf(
     data: GuidedDirections, region: wp.int32, s: Surface, wi: wp.vec3, bsdf_pdf: wp.float32
 ) -> wp.float32:
     share = bsdf_share(data, region, s.bsdf)
-    return share * bsdf_pdf + (1.0 - share) * quadtree_pdf(data.trees[region], data.bits, wi)
+    return share * bsdf_pdf + (1.0 - share) * tree_pdf(data, region, s, wi)
 
 
 GUIDED_DIRECTIONS = DirectionSampler("guided", GuidedDirections, guided_direction, guided_direction_pdf)

@@ -7,6 +7,7 @@ samples, and the one with the least sum is taken. Sums of earlier frames fade.
 
 import warp as wp
 
+from warp_gi.kernels.octree import Octree, OctreeNodes, leaf_cell
 from warp_gi.kernels.quadtree_adapt import LARGEST_CONTRIBUTION
 from warp_gi.kernels.samples import SURFACE_GLOSSY, LeafSamples, SampleRecords, mixture_densities
 from warp_gi.kernels.sampling import spread_place
@@ -16,21 +17,23 @@ wp.set_module_options({"enable_backward": False})
 SHARES = 6
 ShareMoments = wp.types.vector(length=SHARES, dtype=wp.float32)
 FADING = wp.constant(wp.float32(0.8))  # of what is known, each frame
+NEAREST_ANCHOR = wp.constant(wp.float32(0.8))  # largest radius of a cell over that of its anchor's sphere
+CORRECTION = wp.constant(wp.float32(0.2))  # of an anchor's nearness, below which it is left
 
 
 # One of the shares that are tried. A direction that the quadtree has no idea of has a weight of up to 1 / share.
 @wp.func
 def candidate_share(k: wp.int32) -> wp.float32:
     if k == 0:
-        return 0.3
+        return 0.1
     if k == 1:
-        return 0.4
+        return 0.2
     if k == 2:
-        return 0.5
+        return 0.35
     if k == 3:
-        return 0.65
+        return 0.5
     if k == 4:
-        return 0.8
+        return 0.75
     return 0.97
 
 
@@ -51,6 +54,8 @@ class GuideKnowledge:
     trees: wp.array(dtype=wp.vec4ui)  # [leaf]
     shares: wp.array(dtype=wp.vec2)  # [leaf]
     moments: wp.array(dtype=ShareMoments)  # [2 leaf + is glossy]
+    anchors: wp.array(dtype=wp.vec4)  # [leaf] see parallax.py
+    nearness: wp.array(dtype=wp.vec2)  # [leaf] sums of light, and of light over the distance it came from
     energies: wp.array(dtype=wp.float32)  # [leaf * 4 * bits] QuadtreeAdaptation.energies
 
 
@@ -63,6 +68,8 @@ def take_over_guides(
     guides: GuideKnowledge,
     first_tree: wp.vec4ui,
     first_share: wp.float32,
+    octree: Octree,
+    tree: OctreeNodes,
 ):
     leaf = first + wp.tid()
     origin = origins[leaf]
@@ -72,22 +79,36 @@ def take_over_guides(
         if origin >= 0:
             energy = known.energies[origin * size + i]
         guides.energies[leaf * size + i] = energy
+    cell = leaf_cell(octree, tree, leaf)
+    guides.anchors[leaf] = wp.vec4(cell[0], cell[1], cell[2], 0.0)
+    guides.nearness[leaf] = wp.vec2(0.0, 0.0)
     if origin < 0:
         guides.trees[leaf] = first_tree
         guides.shares[leaf] = wp.vec2(first_share, first_share)
         guides.moments[2 * leaf] = ShareMoments()
         guides.moments[2 * leaf + 1] = ShareMoments()
         return
+    nearness = wp.min(known.anchors[origin][3], NEAREST_ANCHOR / cell[3])
+    guides.anchors[leaf] = wp.vec4(cell[0], cell[1], cell[2], nearness)
+    guides.nearness[leaf] = known.nearness[origin]
     guides.trees[leaf] = known.trees[origin]
     guides.shares[leaf] = known.shares[origin]
     guides.moments[2 * leaf] = known.moments[2 * origin]
     guides.moments[2 * leaf + 1] = known.moments[2 * origin + 1]
 
 
-# Thread: a leaf. Adds its samples to the moments of every share, and chooses.
+# Thread: a leaf. Adds its samples to the moments of every share, and chooses; and moves the sphere of its anchor to
+# where light comes from.
 @wp.kernel
 def adapt_shares(
-    first: wp.int32, samples: LeafSamples, records: SampleRecords, guides: GuideKnowledge, first_share: wp.float32
+    first: wp.int32,
+    samples: LeafSamples,
+    records: SampleRecords,
+    guides: GuideKnowledge,
+    octree: Octree,
+    tree: OctreeNodes,
+    first_share: wp.float32,
+    adapts: wp.int32,
 ):
     leaf = first + wp.tid()
     count = samples.counts[leaf]
@@ -96,10 +117,12 @@ def adapt_shares(
     rough = guides.moments[2 * leaf] * FADING
     glossy = guides.moments[2 * leaf + 1] * FADING
     looks = wp.min(count, samples.most)
+    nearness = guides.nearness[leaf] * FADING
     for k in range(looks):
         slot = samples.order[samples.starts[leaf] + spread_place(k, looks, count)]
         contribution = records.contributions[slot]
         if contribution > 0.0 and contribution < LARGEST_CONTRIBUTION:
+            nearness = nearness + contribution * wp.vec2(1.0, records.nearness[slot])
             densities = mixture_densities(records.mixtures[slot])
             square = contribution * contribution
             is_glossy = (records.lights[slot] & SURFACE_GLOSSY) != wp.uint32(0)
@@ -112,4 +135,14 @@ def adapt_shares(
                     rough[c] = rough[c] + moment
     guides.moments[2 * leaf] = rough
     guides.moments[2 * leaf + 1] = glossy
-    guides.shares[leaf] = wp.vec2(best_share(rough, first_share), best_share(glossy, first_share))
+    if adapts != 0:
+        guides.shares[leaf] = wp.vec2(best_share(rough, first_share), best_share(glossy, first_share))
+    guides.nearness[leaf] = nearness
+    if nearness[0] > 0.0:
+        anchor = guides.anchors[leaf]
+        cell = leaf_cell(octree, tree, leaf)
+        found = wp.min(nearness[1] / nearness[0], NEAREST_ANCHOR / cell[3])
+        # small corrections would only unsettle the tree
+        if wp.abs(found - anchor[3]) > CORRECTION * wp.max(found, anchor[3]):
+            anchor[3] = found
+            guides.anchors[leaf] = anchor

@@ -5,9 +5,13 @@ over a power of two of buckets by the last bits of their index. Selecting one pi
 bring to the region, weighs all of them for the very point (ltc.py), and picks one by weight. (The paper has no first
 bucket, and picks buckets evenly: in a room of a hundred lamps, the near ones are in the bucket that was not picked.)
 
-With a small share, and where the cache has nothing to offer, a light is explored instead, by the hierarchy over all
-lights (or an alias table, the paper's way). Both ways can yield a light, and its probability is that of both together
-(Algorithm 1), so that estimates are unbiased whatever the cache holds.
+The weight of a light has a factor, its rate, for how often it is seen from the region (light_cache_build.py).
+
+With a share of samples, and where the cache has nothing to offer, another light is explored, by the hierarchy over all
+lights (or an alias table, the paper's way). Either can yield any light: both are weighed by the power heuristic, so
+that estimates are unbiased whatever the cache holds. (Algorithm 1 explores instead, and mixes both probabilities. A
+sample that explores in vain is then missing from the estimate: with a share e the relative variance grows by about e,
+which was more than half of all there was, and made regions explore too little to find what they did not know.)
 """
 
 import warp as wp
@@ -27,19 +31,16 @@ wp.set_module_options({"enable_backward": False})
 MOST_BUCKETS = wp.constant(64)  # of a region, beside its first
 
 
-EXPLORATIONS = 6  # shares of exploration that are tried
-ExplorationMoments = wp.types.vector(length=EXPLORATIONS, dtype=wp.float32)
-
-
 # The lights of every region.
 @wp.struct
 class CacheTables:
     buckets: wp.array(dtype=wp.int32)  # [leaf] number of buckets: 0, 1, or 1 and a power of two
     offsets: wp.array(dtype=wp.int32)  # [leaf] start in `items` and `chances`
     items: wp.array(dtype=wp.int32)  # of each leaf: where its buckets end, then the emitters bucket by bucket
+    rates: wp.array(dtype=wp.float32)  # [as items] factors of the weights of lights
     chances: wp.array(dtype=wp.float32)  # of each leaf: of its buckets up to this one together; 1 for the last
     exploration: wp.array(dtype=wp.float32)  # [leaf] share of samples that explore
-    moments: wp.array(dtype=ExplorationMoments)  # [leaf] what adapt_exploration learns it from
+    moments: wp.array(dtype=wp.vec2)  # [leaf] second moments of light samples that do not explore, and that do
 
 
 @wp.struct
@@ -186,10 +187,13 @@ def weigh_bucket(cache: LightCache, s: Surface, wo: wp.vec3, bucket: Bucket) -> 
     r = WeighedBucket()
     w = lobe_weights(cache.ltc, s.bsdf, wo)
     origin = ray_origin(s)
-    r.weights = weigh_triangles(cache.shapes, cache.tables.items, bucket.begin, bucket.count, origin, s.shading, w)
+    r.weights = weigh_triangles(
+        cache.shapes, cache.tables.items, cache.tables.rates, bucket.begin, bucket.count, origin, s.shading, w
+    )
     for k in range(bucket.count):
         if r.weights[k] < 0.0:
-            r.weights[k] = light_weight(cache, s, wo, origin, w, cache.tables.items[bucket.begin + k])
+            weight = light_weight(cache, s, wo, origin, w, cache.tables.items[bucket.begin + k])
+            r.weights[k] = weight * cache.tables.rates[bucket.begin + k]
         r.total += r.weights[k]
     if r.total <= 0.0:
         for k in range(bucket.count):
@@ -198,69 +202,90 @@ def weigh_bucket(cache: LightCache, s: Surface, wo: wp.vec3, bucket: Bucket) -> 
     return r
 
 
-# Algorithm 1 of temporal_reuse.txt: either way one bucket is weighed, and once.
+# The power heuristic's weight of a choice over that of the balance heuristic. `pdf` and `other` are the numbers of
+# times that this choice and the other one are expected to select the light: where the cache offers it, exploring hardly
+# counts, and so a sample that explores in vain takes nothing from the estimate.
+@wp.func
+def choice_weight(pdf: wp.float32, other: wp.float32) -> wp.float32:
+    larger = wp.max(pdf, other)
+    a = pdf / larger
+    b = other / larger
+    return a * (a + b) / (a * a + b * b)
+
+
+# One of the lights that the cache offers.
 @wp.func
 def cached_light(
     cache: LightCache, scene: SceneData, region: wp.int32, s: Surface, wo: wp.vec3, u: wp.vec2
 ) -> LightChoice:
     r = LightChoice()
+    r.item = -1
     here = cache_region(cache, region)
-    found = BucketPlace()
-    found.place = -1
-    rest = float(0.0)
-    explored_pdf = float(0.0)
-    if u[0] < here.explores:
-        stretch = 1.0 / here.explores  # of what is left of u[0], whose digits u[1] continues
-        rest = wp.min(u[0] * stretch, LARGEST_FLOAT_BELOW_ONE)
-        r = explored_light(cache, scene, s, wp.vec2(rest, u[1] * stretch))
-        explored_pdf = here.explores * r.pdf
-        if r.item >= 0:
-            found = find_light(cache.tables, here, r.item)
-    else:
-        rest = wp.min((u[0] - here.explores) / (1.0 - here.explores), LARGEST_FLOAT_BELOW_ONE)
+    if here.buckets > 0:
         number = int(0)
-        while number < here.buckets - 1 and rest >= cache.tables.chances[here.items + number]:
+        while number < here.buckets - 1 and u[0] >= cache.tables.chances[here.items + number]:
             number += 1
-        found.bucket = bucket_of(cache.tables, here, number)
+        bucket = bucket_of(cache.tables, here, number)
+        left = float(u[0])
         if number > 0:
-            rest = rest - cache.tables.chances[here.items + number - 1]
-        rest = wp.clamp(rest / found.bucket.chance, 0.0, LARGEST_FLOAT_BELOW_ONE)
-    r.pdf = explored_pdf
-    if found.place >= 0 or u[0] >= here.explores:
-        weighed = weigh_bucket(cache, s, wo, found.bucket)
-        if found.place < 0:
-            left = rest * weighed.total
-            for k in range(found.bucket.count):
-                if weighed.weights[k] > 0.0:
-                    found.place = k  # the last one that can be selected, should rounding leave something
-                    if left < weighed.weights[k]:
-                        break
-                    left = left - weighed.weights[k]
-            r.item = cache.tables.items[found.bucket.begin + found.place]
-            explored_pdf = here.explores * explored_light_pdf(cache, scene, s, r.item)
-        share = (1.0 - here.explores) * found.bucket.chance
-        r.pdf = explored_pdf + share * weighed.weights[found.place] / weighed.total
-    r.explores = here.explores
-    if r.pdf > 0.0:
-        r.by_exploring = explored_pdf / r.pdf
+            left = left - cache.tables.chances[here.items + number - 1]
+        weighed = weigh_bucket(cache, s, wo, bucket)
+        left = wp.clamp(left / bucket.chance, 0.0, LARGEST_FLOAT_BELOW_ONE) * weighed.total
+        place = int(-1)
+        for k in range(bucket.count):
+            if weighed.weights[k] > 0.0:
+                place = k  # the last one that can be selected, should rounding leave something
+                if left < weighed.weights[k]:
+                    break
+                left = left - weighed.weights[k]
+        r.item = cache.tables.items[bucket.begin + place]
+        pdf = bucket.chance * weighed.weights[place] / weighed.total
+        explored = here.explores * explored_light_pdf(cache, scene, s, r.item)
+        r.pdf = pdf + explored
+        r.weight = choice_weight(pdf, explored)
     return r
 
 
-# Probability with which cached_light selects an emitter.
+# Number of times that the cache selects an emitter, a probability.
+@wp.func
+def offered_pdf(cache: LightCache, here: CacheRegion, s: Surface, wo: wp.vec3, emitter: wp.int32) -> wp.float32:
+    found = find_light(cache.tables, here, emitter)
+    if found.place < 0:
+        return 0.0
+    weighed = weigh_bucket(cache, s, wo, found.bucket)
+    return found.bucket.chance * weighed.weights[found.place] / weighed.total
+
+
+# With the probability of exploring in the region, one of all lights.
+@wp.func
+def another_light(
+    cache: LightCache, scene: SceneData, region: wp.int32, s: Surface, wo: wp.vec3, u: wp.vec3
+) -> LightChoice:
+    r = LightChoice()
+    r.item = -1
+    here = cache_region(cache, region)
+    if u[0] < here.explores:
+        r = explored_light(cache, scene, s, wp.vec2(u[1], u[2]))
+        if r.item >= 0:
+            explored = here.explores * r.pdf
+            pdf = offered_pdf(cache, here, s, wo, r.item)
+            r.pdf = pdf + explored
+            r.weight = choice_weight(explored, pdf)
+            r.explores = 1
+    return r
+
+
+# Number of times that both together are expected to select an emitter.
 @wp.func
 def cached_light_pdf(
     cache: LightCache, scene: SceneData, region: wp.int32, s: Surface, wo: wp.vec3, emitter: wp.int32
 ) -> wp.float32:
     here = cache_region(cache, region)
     pdf = here.explores * explored_light_pdf(cache, scene, s, emitter)
-    found = find_light(cache.tables, here, emitter)
-    if found.place >= 0:
-        weighed = weigh_bucket(cache, s, wo, found.bucket)
-        pdf = pdf + (1.0 - here.explores) * found.bucket.chance * weighed.weights[found.place] / weighed.total
-    return pdf
+    return pdf + offered_pdf(cache, here, s, wo, emitter)
 
 
-CACHED_LIGHTS = LightSampler("cache", LightCache, cached_light, cached_light_pdf)
+CACHED_LIGHTS = LightSampler("cache", LightCache, cached_light, cached_light_pdf, another_light)
 
 
 # Thread: an emissive triangle. Its shape as it is now.

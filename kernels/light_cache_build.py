@@ -1,19 +1,19 @@
 """Making a region's light cache from the last frame's samples (temporal_reuse.txt, section 4.1).
 
 Lights that a region's samples saw are listed once each (`list_seen_lights`), joined with those of its six neighbours
-and with what it knew before (`join_lights`), ranked (`rank_lights`), and spread over buckets (`count_buckets`,
-`fill_buckets`). Lists are sorted by emitter, so joining is a merge, and buckets come out sorted. An entry is
-emitter << 8 | frames since a sample of the region or its neighbours saw it: a light that is seen rarely stays for some
-frames, which the paper leaves for future work (section 8).
+and with what it knew before (`join_lights`), rated by how often samples see them (`weigh_light_samples`), ranked
+(`rank_lights`), and spread over buckets (`count_buckets`, `fill_buckets`). Lists are sorted by emitter, so joining is
+a merge, and buckets come out sorted. An entry is emitter << 8 | frames since a sample of the region or its neighbours
+saw it: a light that is seen rarely stays for some frames, which the paper leaves for future work (section 8).
 """
 
 import warp as wp
 
 from warp_gi.kernels.bsdf import luminance
-from warp_gi.kernels.light_cache import EXPLORATIONS, MOST_BUCKETS, CacheTables, ExplorationMoments, LightCache
+from warp_gi.kernels.light_cache import MOST_BUCKETS, CacheTables, LightCache
 from warp_gi.kernels.octree import NEIGHBOURS, Octree, OctreeNodes, leaf_cell
 from warp_gi.kernels.quadtree_adapt import LARGEST_CONTRIBUTION
-from warp_gi.kernels.samples import LIGHT_ITEM, LIGHT_VISIBLE, LeafSamples, SampleRecords, mixture_densities
+from warp_gi.kernels.samples import LIGHT_BLOCKED, LIGHT_EXPLORED, LIGHT_ITEM, LIGHT_VISIBLE, LeafSamples, SampleRecords
 from warp_gi.kernels.sampling import spread_place
 from warp_gi.kernels.types import EMITTER_DIRECTIONAL, EMITTER_TRIANGLE
 
@@ -32,12 +32,16 @@ class LightLists:
     offsets: wp.array(dtype=wp.int32)  # [leaf] start in `entries`
     counts: wp.array(dtype=wp.int32)  # [leaf]
     entries: wp.array(dtype=wp.int32)
+    tries: wp.array(dtype=wp.vec2)  # of each entry: (samples that saw it, all that tried), none in what was just seen
 
 
 @wp.struct
 class CacheSettings:
     capacity: wp.int32  # lights a bucket
     hysteresis: wp.float32  # share of the capacity that must suffice for fewer buckets than before
+    first_exploration: wp.float32  # share of samples, of regions that nothing is known of
+    least_exploration: wp.float32
+    most_exploration: wp.float32
 
 
 # Ascending order, by Shell's method.
@@ -150,19 +154,117 @@ def join_lights(
             entry = wp.min(entry, known.entries[heads[7]] + 1)
         if entry == LATEST:
             break
+        tries = wp.vec2(0.0, 0.0)
         for k in range(7):
             if heads[k] < ends[k] and (seen.entries[heads[k]] >> 8) == (entry >> 8):
                 heads[k] = heads[k] + 1
         if heads[7] < ends[7] and (known.entries[heads[7]] >> 8) == (entry >> 8):
+            tries = known.tries[heads[7]]
             heads[7] = heads[7] + 1
         if (entry & 255) <= memory:
             joined.entries[begin + count] = entry
+            joined.tries[begin + count] = tries
             count += 1
     joined.counts[leaf] = count
 
 
+EXPLORATION_PRICE = wp.constant(wp.float32(0.25))
+MOST_TRIES = wp.constant(wp.float32(32.0))  # that are remembered of a light
+
+
+# Factor for the weight of a light that `tries` (seen, all) of a region's samples tried. A light that a share r of them
+# sees has second moments r times as large there, and the best density goes by their root. Starts from one half.
+@wp.func
+def visibility_rate(tries: wp.vec2) -> wp.float32:
+    return wp.sqrt((tries[0] + 0.5) / (tries[1] + 1.0))
+
+
+# Place of an emitter's entry in a leaf's list, -1 if it is not there.
+@wp.func
+def find_entry(lists: LightLists, leaf: wp.int32, emitter: wp.int32) -> wp.int32:
+    low = lists.offsets[leaf]
+    end = low + lists.counts[leaf]
+    high = int(end)
+    while low < high:
+        middle = (low + high) / 2
+        if (lists.entries[middle] >> 8) < emitter:
+            low = middle + 1
+        else:
+            high = middle
+    if low < end and (lists.entries[low] >> 8) == emitter:
+        return low
+    return -1
+
+
+FADING = wp.constant(wp.float32(0.8))  # of moments, each frame
+
+
+# Share of samples that explore. What exploring brings, of lights that the cache does not offer, varies with moments[1]
+# over the share, and the rest with at most moments[0]. The share is that for which the former is a quarter of the
+# share times the latter, about what exploring costs.
+@wp.func
+def exploration_share(moments: wp.vec2, settings: CacheSettings) -> wp.float32:
+    share = settings.most_exploration
+    if moments[0] > 0.0:
+        share = wp.sqrt(moments[1] / (moments[0] * EXPLORATION_PRICE))
+    return wp.clamp(share, settings.least_exploration, settings.most_exploration)
+
+
+# Thread: a leaf. Counts how often each of its lights was tried by its samples, and how often seen; and learns how
+# much to explore.
+@wp.kernel
+def weigh_light_samples(
+    first: wp.int32,
+    settings: CacheSettings,
+    samples: LeafSamples,
+    records: SampleRecords,
+    joined: LightLists,
+    origins: wp.array(dtype=wp.int32),
+    known: CacheTables,
+    tables: CacheTables,
+):
+    leaf = first + wp.tid()
+    origin = origins[leaf]
+    moments = wp.vec2(0.0, 0.0)
+    share = float(settings.first_exploration)
+    if origin >= 0:
+        moments = known.moments[origin]
+        share = known.exploration[origin]
+    count = samples.counts[leaf]
+    looks = wp.min(count, samples.most)
+    offered = float(0.0)
+    explored = float(0.0)
+    for k in range(looks):
+        slot = samples.order[samples.starts[leaf] + spread_place(k, looks, count)]
+        word = records.lights[slot]
+        value = records.light_values[slot]
+        if (word & LIGHT_EXPLORED) != wp.uint32(0):
+            if value < LARGEST_CONTRIBUTION:
+                explored += value * value
+        elif (word & (LIGHT_VISIBLE | LIGHT_BLOCKED)) != wp.uint32(0):
+            place = find_entry(joined, leaf, wp.int32(word & LIGHT_ITEM) - 1)
+            seen = float(0.0)
+            if (word & LIGHT_VISIBLE) != wp.uint32(0):
+                seen = 1.0
+                if value < LARGEST_CONTRIBUTION:
+                    offered += value * value
+            if place >= 0:
+                joined.tries[place] = joined.tries[place] + wp.vec2(seen, 1.0)
+    if origin >= 0 and count > 0:
+        if known.buckets[origin] > 0:  # else all of the light came by exploring, which says nothing
+            moments = moments * FADING + wp.vec2(offered, explored * share)
+            share = exploration_share(moments, settings)
+    tables.moments[leaf] = moments
+    tables.exploration[leaf] = wp.clamp(share, settings.least_exploration, settings.most_exploration)
+    begin = joined.offsets[leaf]
+    for i in range(begin, begin + joined.counts[leaf]):
+        tries = joined.tries[i]
+        if tries[1] > MOST_TRIES:
+            joined.tries[i] = tries * (MOST_TRIES / tries[1])
+
+
 MAIN = wp.constant(wp.float32(-1.0))  # instead of the importance of lights in the first bucket
-LEAST_CHANCE = wp.constant(wp.float32(0.05))  # shared by all buckets evenly
+LEAST_CHANCE = wp.constant(wp.float32(0.02))  # shared by all buckets evenly
 
 
 # Irradiance that a light may bring to a region around `center`, but for what it meets there at a slant.
@@ -205,7 +307,8 @@ def rank_lights(
     cell = leaf_cell(octree, tree, leaf)
     center = wp.vec3(cell[0], cell[1], cell[2])
     for i in range(begin, begin + count):
-        importances[i] = region_importance(cache, joined.entries[i] >> 8, center, cell[3])
+        importance = region_importance(cache, joined.entries[i] >> 8, center, cell[3])
+        importances[i] = importance * visibility_rate(joined.tries[i])
     total = float(0.0)
     if count <= capacity:  # all of them
         for i in range(begin, begin + count):
@@ -296,6 +399,7 @@ def fill_buckets(
                 belongs = not belongs and (emitter & (buckets - 2)) == bucket - 1
             if belongs and held < settings.capacity:
                 tables.items[start + buckets + place] = emitter
+                tables.rates[start + buckets + place] = visibility_rate(joined.tries[i])
                 place += 1
                 held += 1
                 brought += wp.max(importances[i], 0.0)
@@ -318,67 +422,3 @@ def fill_buckets(
     for bucket in range(buckets):
         if tables.chances[start + bucket] >= sum:
             tables.chances[start + bucket] = 1.0
-
-
-FADING = wp.constant(wp.float32(0.8))  # of what is known, each frame
-
-
-# One of the shares of exploration that are tried.
-@wp.func
-def candidate_exploration(k: wp.int32) -> wp.float32:
-    if k == 0:
-        return 0.05
-    if k == 1:
-        return 0.1
-    if k == 2:
-        return 0.2
-    if k == 3:
-        return 0.4
-    if k == 4:
-        return 0.65
-    return 0.9
-
-
-# Thread: a leaf. Its share of exploration: that with which its light samples would have varied least, as guided_shares
-# explains. It falls where nothing new is found, and rises where the cache cannot hold what there is.
-@wp.kernel
-def adapt_exploration(
-    first: wp.int32,
-    samples: LeafSamples,
-    records: SampleRecords,
-    origins: wp.array(dtype=wp.int32),
-    known: CacheTables,
-    tables: CacheTables,
-    first_share: wp.float32,
-):
-    leaf = first + wp.tid()
-    origin = origins[leaf]
-    moments = ExplorationMoments()
-    share = first_share
-    if origin >= 0:
-        moments = known.moments[origin]
-        share = known.exploration[origin]
-    count = samples.counts[leaf]
-    if count > 0:
-        moments = moments * FADING
-        looks = wp.min(count, samples.most)
-        for k in range(looks):
-            slot = samples.order[samples.starts[leaf] + spread_place(k, looks, count)]
-            if (records.lights[slot] & LIGHT_VISIBLE) != wp.uint32(0):
-                word = records.light_mixtures[slot]
-                value = records.light_values[slot]
-                # a region that knew nothing could only explore, which says nothing
-                if (word >> wp.uint32(16)) < wp.uint32(65535) and value < LARGEST_CONTRIBUTION:
-                    square = value * value
-                    densities = mixture_densities(word)
-                    for c in range(EXPLORATIONS):
-                        a = candidate_exploration(c)
-                        moment = square / wp.max(a * densities[0] + (1.0 - a) * densities[1], 1.0e-6)
-                        moments[c] = moments[c] + moment
-        least = float(wp.inf)
-        for c in range(EXPLORATIONS):
-            if moments[c] > 0.0 and moments[c] < least:
-                least = moments[c]
-                share = candidate_exploration(c)
-    tables.moments[leaf] = moments
-    tables.exploration[leaf] = share

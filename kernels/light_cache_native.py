@@ -26,7 +26,7 @@ class LightShape:
     unused: wp.float32  # makes it twelve words
 
 
-# Weights of the lights items[begin ... begin + count), LEFT_OUT for those that ltc.py has to weigh.
+# Weights of the lights items[begin ... begin + count) times their rates, LEFT_OUT for those that ltc.py has to weigh.
 @wp.func_native(
     snippet="""
     wp::vec_t<32, float> result;
@@ -183,7 +183,10 @@ class LightShape:
         }
         weight = dark ? zero : luminance * weight;
         weight = left_out & (~dark | (luminance <= 0.0f)) ? zero - 1.0f : weight;
-        for (int lane = 0; lane < 8 && start + lane < count; ++lane) result[start + lane] = weight[lane];
+        for (int lane = 0; lane < 8 && start + lane < count; ++lane) {
+            const float rate = weight[lane] < 0.0f ? 1.0f : rates.data[begin + start + lane];
+            result[start + lane] = weight[lane] * rate;
+        }
     }
 #endif
     return result;
@@ -192,6 +195,7 @@ class LightShape:
 def weigh_triangles(
     shapes: wp.array(dtype=LightShape),
     items: wp.array(dtype=wp.int32),
+    rates: wp.array(dtype=wp.float32),
     begin: wp.int32,
     count: wp.int32,
     origin: wp.vec3,

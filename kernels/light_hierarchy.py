@@ -320,6 +320,7 @@ def hierarchy_light(
 ) -> LightChoice:
     choice = hierarchy_choice(data, ray_origin(s), shading_normal(s), u[0], u[1])
     light = LightChoice()
+    light.weight = 1.0
     light.item = choice.item
     light.pdf = choice.pdf
     return light

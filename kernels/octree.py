@@ -79,6 +79,16 @@ def cell_code(octree: Octree, position: wp.vec3) -> wp.uint32:
     return morton_code_3d(x, y, z)
 
 
+# Middle of the finest cell with a code.
+@wp.func
+def code_position(octree: Octree, code: wp.uint32) -> wp.vec3:
+    x = gather_bits(code)
+    y = gather_bits(code >> wp.uint32(1))
+    z = gather_bits(code >> wp.uint32(2))
+    cell = wp.vec3(wp.float32(x) + 0.5, wp.float32(y) + 0.5, wp.float32(z) + 0.5)
+    return octree.low + cell / octree.scale
+
+
 @wp.func_native(
     snippet="""
 #if defined(__CUDA_ARCH__)

@@ -25,7 +25,8 @@ class LightSampler(NamedTuple):
     name: str
     data: Any  # struct
     choose: wp.Function  # (data, scene, region, surface, wo, u: vec2) -> LightChoice
-    pdf: wp.Function  # (data, scene, region, surface, wo, emitter) -> probability that `choose` selects it
+    pdf: wp.Function  # (data, scene, region, surface, wo, emitter) -> LightChoice.pdf of that emitter
+    explore: wp.Function | None = None  # (the same as `choose`, but u: vec3) -> another LightChoice, or none
 
 
 class DirectionSampler(NamedTuple):
@@ -47,7 +48,8 @@ class Regions(NamedTuple):
     at: wp.Function  # (data, slot, vertex) -> slot of a vertex of the path, or -1: keep none
     begin: wp.Function  # (data, slot, surface): a sample at a vertex
     light: wp.Function  # (data, slot, choice, whether it arrives, luminance that it brings to the picture)
-    direction: wp.Function  # (data, slot, surface, sample, light of the path so far)
+    # (data, slot, sample, one over the distance to what it hits, throughput up to the vertex, light of the path so far)
+    direction: wp.Function
     end: wp.Function  # (data, slot, vertices, light of the path)
 
 
@@ -83,6 +85,7 @@ def alias_light(
     light = LightChoice()
     light.item = choice.item
     light.pdf = choice.pdf
+    light.weight = 1.0
     return light
 
 
@@ -91,6 +94,14 @@ def alias_light_pdf(
     data: AliasLights, scene: SceneData, region: wp.int32, s: Surface, wo: wp.vec3, emitter: wp.int32
 ) -> wp.float32:
     return scene.emitters.alias[emitter].pdf
+
+
+# For samplers that make one choice.
+@wp.func
+def no_light(data: Any, scene: SceneData, region: wp.int32, s: Surface, wo: wp.vec3, u: wp.vec3) -> LightChoice:
+    r = LightChoice()
+    r.item = -1
+    return r
 
 
 @wp.struct
@@ -162,7 +173,14 @@ def keep_no_light(data: NoRegions, slot: wp.int32, choice: LightChoice, visible:
 
 
 @wp.func
-def keep_no_direction(data: NoRegions, slot: wp.int32, s: Surface, sample: DirectionSample, light: wp.float32):
+def keep_no_direction(
+    data: NoRegions,
+    slot: wp.int32,
+    sample: DirectionSample,
+    nearness: wp.float32,
+    carried: wp.float32,
+    light: wp.float32,
+):
     pass
 
 

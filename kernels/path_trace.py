@@ -34,6 +34,7 @@ from warp_gi.kernels.path_samplers import (
     DirectionSampler,
     LightSampler,
     Regions,
+    no_light,
     sample_weight,
 )
 from warp_gi.kernels.sampling import balance, pixel_sample_index, pixel_seed, random_1d, sample_1d, sample_2d
@@ -88,7 +89,7 @@ class PathBuffers:
 # A light sample that arrives: nothing in between, and the surface reflects some of it.
 @wp.struct
 class LightConnection:
-    arrives: wp.int32  # 0: it does not, and nothing else is set
+    arrives: wp.int32  # 1; 0 or, of an emitter with something in between, -1: it does not, and nothing else is set
     direction: wp.vec3
     reflected: wp.vec3  # f cos(wi) times the radiance (over the pdf already where `delta`)
     pdf: wp.float32  # of the light sample
@@ -109,7 +110,7 @@ def connect_sky(scene: SceneData, s: Surface, wo: wp.vec3, u: wp.vec3) -> LightC
         return r
     r.arrives = 1
     r.direction = e.direction
-    r.reflected = wp.cw_mul(f.value, environment_radiance(scene.environment, e.direction))
+    r.reflected = wp.cw_mul(f.value, e.radiance)
     r.pdf = e.pdf
     r.bsdf_pdf = f.pdf
     return r
@@ -126,6 +127,7 @@ def connect_emitter(scene: SceneData, s: Surface, wo: wp.vec3, choice: LightChoi
     if f.pdf <= 0.0 or wp.max(e.radiance) <= 0.0:
         return r
     if bvh_occluded(scene.bvh, origin, e.direction, e.distance * SHADOW_END):
+        r.arrives = -1
         return r
     r.arrives = 1
     r.direction = e.direction
@@ -152,6 +154,18 @@ def light_2d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32, at_first: w
     return wp.vec2(random_1d(index, seed, dimension + 4096), random_1d(index, seed, dimension + 8192))
 
 
+# Numbers for the choice of another light, and for the point on it.
+@wp.func
+def explore_3d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32) -> wp.vec3:
+    u = explore_2d(index, seed, dimension + 2)
+    return wp.vec3(random_1d(index, seed, dimension + 12288), u[0], u[1])
+
+
+@wp.func
+def explore_2d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32) -> wp.vec2:
+    return wp.vec2(random_1d(index, seed, dimension + 12289), random_1d(index, seed, dimension + 12290))
+
+
 class PathTracer(NamedTuple):
     """What is made for one combination of samplers."""
 
@@ -166,6 +180,7 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
     """Return the path tracer that uses these samplers; made once. The regions follow from the samplers."""
 
     light_data, direction_data, region_data = lights.data, directions.data, regions.data
+    explore, choices = (no_light, 1) if lights.explore is None else (lights.explore, 2)
 
     @wp.struct
     class Samplers:
@@ -266,28 +281,36 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
                         r.indirect = r.indirect + wp.cw_mul(throughput, light)
             if wants_emitter:
                 choice = lights.choose(samplers.lights, scene, region, s, wo, u_select)
-                sample = connect_emitter(scene, s, wo, choice, light_2d(index, seed, d + 3, at_first))
-                light = wp.vec3(0.0, 0.0, 0.0)
-                if sample.arrives != 0:
-                    light = sample.reflected / emitter_share
-                    if sample.delta == 0:
-                        pdf = directions.pdf(samplers.directions, region, s, sample.direction, sample.bsdf_pdf)
-                        light = sample.reflected / (sample.pdf * emitter_share + pdf)
-                if at_first:
-                    r.emitters = light
-                else:
-                    light = wp.cw_mul(throughput, light)
-                    r.indirect = r.indirect + light
-                if at >= 0:
-                    regions.light(samplers.regions, at, choice, sample.arrives, luminance(light))
+                u_point = light_2d(index, seed, d + 3, at_first)
+                for turn in range(int(choices)):
+                    if turn > 0:
+                        u_explore = explore_3d(index, seed, d)
+                        choice = explore(samplers.lights, scene, region, s, wo, u_explore)
+                        u_point = explore_2d(index, seed, d)
+                    if choice.item >= 0:
+                        sample = connect_emitter(scene, s, wo, choice, u_point)
+                        light = wp.vec3(0.0, 0.0, 0.0)
+                        if sample.arrives > 0:
+                            light = sample.reflected * (choice.weight / emitter_share)
+                            if sample.delta == 0:
+                                pdf = directions.pdf(samplers.directions, region, s, sample.direction, sample.bsdf_pdf)
+                                light = sample.reflected * (choice.weight / (sample.pdf * emitter_share + pdf))
+                        if at_first:
+                            r.emitters = r.emitters + light
+                        else:
+                            light = wp.cw_mul(throughput, light)
+                            r.indirect = r.indirect + light
+                        if at >= 0:
+                            regions.light(samplers.regions, at, choice, sample.arrives, luminance(light))
             if not goes_on:
                 vertices += 1
                 break
+            carried = luminance(throughput)
             throughput = wp.cw_mul(throughput, sample_weight(s.bsdf, b.weight))
             reflected = wp.cw_mul(reflected, sample_weight(s.bsdf, b.reflected))
             if hit.face < 0:
                 if at >= 0:
-                    regions.direction(samplers.regions, at, s, b, luminance(r.environment + r.indirect))
+                    regions.direction(samplers.regions, at, b, 0.0, carried, luminance(r.environment + r.indirect))
                 vertices += 1
                 if sees_sky:
                     sky = environment_lookup(scene.environment, wi)
@@ -310,7 +333,8 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
                 else:
                     r.indirect = r.indirect + light
             if at >= 0 and not is_last:
-                regions.direction(samplers.regions, at, s, b, luminance(r.environment + r.indirect))
+                light = r.environment + r.indirect
+                regions.direction(samplers.regions, at, b, 1.0 / hit.t, carried, luminance(light))
             vertices += 1
             if is_last:
                 break

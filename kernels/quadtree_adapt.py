@@ -10,11 +10,16 @@ integral of f^2 over a leaf however it was sampled, and with it sums of earlier 
 leaves are equally likely, so the density in a leaf of area A is 1 / (n A), and the variance that it causes is
 n A * integral of f^2: that product is what is evened out. (With sums of c^2 of one frame a rare bright sample drew all
 migrations to where it was, and the tree forgot what it had found.)
+
+Contributions are over the throughput of the path up to the vertex: it tells nothing about the light there, and varies.
+Their directions are as seen from the region's anchor (parallax.py).
 """
 
 import warp as wp
 
-from warp_gi.kernels.octahedral import octahedral_encode
+from warp_gi.kernels.octahedral import octahedral_decode, octahedral_encode
+from warp_gi.kernels.octree import Octree, code_position
+from warp_gi.kernels.parallax import seen_from_anchor
 from warp_gi.kernels.quadtree import (
     QUADTREE_LEVELS,
     migrate_block,
@@ -38,6 +43,7 @@ class QuadtreeSamples:
     starts: wp.array(dtype=wp.int32)  # [leaf] first of its records in `order`
     counts: wp.array(dtype=wp.int32)  # [leaf] how many
     order: wp.array(dtype=wp.int32)  # record indices
+    codes: wp.array(dtype=wp.uint32)  # [record] cell of the point
     directions: wp.array(dtype=wp.uint32)  # [record] quadtree_pack_direction
     contributions: wp.array(dtype=wp.float32)  # [record] below 0: no sample
     pdfs: wp.array(dtype=wp.float32)  # [record] 1/sr
@@ -52,6 +58,8 @@ class QuadtreeAdaptation:
     most_samples: wp.int32  # a leaf; taken evenly from its range
     trees: wp.array(dtype=wp.vec4ui)  # [leaf] in and out
     counts: wp.array(dtype=wp.uint32)  # [leaf * bits / 4] out: quadtree_counts
+    anchors: wp.array(dtype=wp.vec4)  # [leaf] see parallax.py
+    octree: Octree
     energies: wp.array(dtype=wp.float32)  # [leaf * 4 * bits] in and out: of each quadrant of each node
 
 
@@ -62,6 +70,14 @@ def quadtree_pack_direction(direction: wp.vec3) -> wp.uint32:
     x = wp.uint32(wp.clamp(uv[0] * 65536.0, 0.0, 65535.0))
     y = wp.uint32(wp.clamp(uv[1] * 65536.0, 0.0, 65535.0))
     return x | (y << wp.uint32(16))
+
+
+# Inverse of quadtree_pack_direction: the middle of what has the same code.
+@wp.func
+def quadtree_unpack_direction(code: wp.uint32) -> wp.vec3:
+    x = (wp.float32(code & wp.uint32(0xFFFF)) + 0.5) / 65536.0
+    y = (wp.float32(code >> wp.uint32(16)) + 0.5) / 65536.0
+    return octahedral_decode(wp.vec2(x, y))
 
 
 ENOUGH_SAMPLES = wp.constant(256)  # of fewer samples, what was known fades less
@@ -94,12 +110,18 @@ def add_energies(samples: QuadtreeSamples, adaptation: QuadtreeAdaptation, item:
     for i in range(taken):
         record = samples.order[samples.starts[item] + spread_place(i, taken, count)]
         contribution = samples.contributions[record]
-        if contribution >= 0.0 and contribution < LARGEST_CONTRIBUTION:
-            code = samples.directions[record]
-            leaf = quadtree_descend(tree, code << wp.uint32(16), code >> wp.uint32(16) << wp.uint32(16))
-            energy = weight * contribution * contribution * square_density(code, samples.pdfs[record])
-            adaptation.energies[base + 4 * (leaf & 255) + (leaf >> 16)] += energy
+        if contribution >= 0.0:
             found = 1
+        if contribution > 0.0 and contribution < LARGEST_CONTRIBUTION:
+            code = samples.directions[record]
+            position = code_position(adaptation.octree, samples.codes[record])
+            seen = seen_from_anchor(adaptation.anchors[item], position, quadtree_unpack_direction(code))
+            if adaptation.anchors[item][3] > 0.0:
+                code = quadtree_pack_direction(seen.direction)
+            leaf = quadtree_descend(tree, code << wp.uint32(16), code >> wp.uint32(16) << wp.uint32(16))
+            density = square_density(code, samples.pdfs[record] / seen.stretch)
+            energy = weight * contribution * contribution * density
+            adaptation.energies[base + 4 * (leaf & 255) + (leaf >> 16)] += energy
     return found
 
 

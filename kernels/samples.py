@@ -19,7 +19,9 @@ from warp_gi.kernels.types import SceneData
 wp.set_module_options({"enable_backward": False})
 
 LIGHT_VISIBLE = wp.constant(wp.uint32(1 << 31))
+LIGHT_BLOCKED = wp.constant(wp.uint32(1 << 30))  # something is in between
 SURFACE_GLOSSY = wp.constant(wp.uint32(1 << 29))
+LIGHT_EXPLORED = wp.constant(wp.uint32(1 << 28))
 LIGHT_ITEM = wp.constant(wp.uint32((1 << 28) - 1))  # emitter + 1; 0: none was sampled
 GLOSSY_ALPHA = wp.constant(wp.float32(0.2))  # GGX alpha below which a surface counts as glossy
 NO_DIRECTION = wp.constant(wp.float32(-1.0))
@@ -52,10 +54,11 @@ class SampleRecords:
     codes: wp.array(dtype=wp.uint32)  # octree cell of the point; EMPTY_CODE: no sample
     lights: wp.array(dtype=wp.uint32)  # LIGHT_*
     light_values: wp.array(dtype=wp.float32)  # luminance that the light sample brought to the picture
-    light_mixtures: wp.array(dtype=wp.uint32)  # pack_mixture of exploring
     directions: wp.array(dtype=wp.uint32)  # quadtree_pack_direction
-    contributions: wp.array(dtype=wp.float32)  # luminance that came to the picture that way, but for emitters it hit
+    contributions: wp.array(dtype=wp.float32)  # luminance reflected of what came that way, but for emitters it hit
     pdfs: wp.array(dtype=wp.float32)  # 1/sr, of the direction
+    carried: wp.array(dtype=wp.float32)  # throughput of the path up to the vertex
+    nearness: wp.array(dtype=wp.float32)  # 1/m, of the point it hit; 0: the sky
     mixtures: wp.array(dtype=wp.uint32)  # pack_mixture of the BSDF
     vertices: wp.int32  # slots of a path
     stride: wp.int32
@@ -116,19 +119,34 @@ def keep_vertex(data: SampleRegions, slot: wp.int32, s: Surface):
     data.records.contributions[slot] = NO_DIRECTION
 
 
+# Of two light samples the explored one, if it arrives.
 @wp.func
 def keep_light(data: SampleRegions, slot: wp.int32, choice: LightChoice, visible: wp.int32, light: wp.float32):
-    word = data.records.lights[slot] | wp.uint32(choice.item + 1)
-    if visible != 0:
+    if choice.item < 0 or (choice.explores != 0 and visible <= 0):
+        return
+    word = (data.records.lights[slot] & SURFACE_GLOSSY) | wp.uint32(choice.item + 1)
+    if choice.explores != 0:
+        word = word | LIGHT_EXPLORED
+    if visible > 0:
         word = word | LIGHT_VISIBLE
+    if visible < 0:
+        word = word | LIGHT_BLOCKED
     data.records.lights[slot] = word
     data.records.light_values[slot] = light
-    data.records.light_mixtures[slot] = pack_mixture(choice.by_exploring, choice.explores)
 
 
-# `light` is what the path had gathered before; `keep_end` makes a difference of it.
+# `light` is what the path had gathered before; `keep_end` makes a difference of it, over what the path `carried`.
 @wp.func
-def keep_direction(data: SampleRegions, slot: wp.int32, s: Surface, sample: DirectionSample, light: wp.float32):
+def keep_direction(
+    data: SampleRegions,
+    slot: wp.int32,
+    sample: DirectionSample,
+    nearness: wp.float32,
+    carried: wp.float32,
+    light: wp.float32,
+):
+    data.records.nearness[slot] = nearness
+    data.records.carried[slot] = carried
     data.records.directions[slot] = quadtree_pack_direction(sample.wi)
     posterior = sample.bsdf_share * sample.bsdf_pdf / sample.pdf
     data.records.mixtures[slot] = pack_mixture(posterior, sample.bsdf_share)
@@ -141,7 +159,8 @@ def keep_end(data: SampleRegions, slot: wp.int32, vertices: wp.int32, light: wp.
     for vertex in range(wp.min(vertices, data.records.vertices)):
         before = data.records.contributions[slot + vertex]
         if before >= 0.0:
-            data.records.contributions[slot + vertex] = wp.max(light - before, 0.0)
+            carried = wp.max(data.records.carried[slot + vertex], 1.0e-6)
+            data.records.contributions[slot + vertex] = wp.max(light - before, 0.0) / carried
 
 
 SAMPLE_REGIONS = Regions(

@@ -85,7 +85,8 @@ class Environment:
     width: wp.int32
     height: wp.int32
     texels: wp.array(dtype=wp.vec3)  # [height * width]
-    alias: wp.array(dtype=AliasBucket)  # [height * width] table over texels
+    alias: wp.array(dtype=AliasBucket)  # [(height - 1) * width] table over patches between texels
+    pdf_scale: wp.float32  # see environment.patch_pdf
 
 
 @wp.struct

@@ -15,7 +15,7 @@ import warp as wp
 
 from warp_gi.kernels.bsdf import bsdf_evaluate, bsdf_sample, bsdf_weight
 from warp_gi.kernels.bvh import bvh_occluded
-from warp_gi.kernels.environment import environment_lookup, environment_radiance, environment_sample
+from warp_gi.kernels.environment import environment_lookup, environment_sample
 from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, tiled_pixel
 from warp_gi.kernels.harmonics import Harmonics, cosine_harmonics, harmonics, vec9
 from warp_gi.kernels.sampling import morton_code, pixel_sample_index, pixel_seed, random_1d, sample_2d
@@ -448,7 +448,7 @@ def sample_sky(first: wp.int32, scene: SceneData, seed: wp.uint32, sky: FieldSky
     e = environment_sample(scene.environment, wp.vec3(u[0], u[1], random_1d(wp.uint32(k), seed, 2)))
     sky.directions[k] = e.direction
     sky.pdfs[k] = e.pdf
-    sky.radiances[k] = environment_radiance(scene.environment, e.direction)
+    sky.radiances[k] = e.radiance
 
 
 # Thread: a pixel. Its light under a low-frequency sky from what it transfers; no ray is traced.

@@ -60,31 +60,26 @@ class _Map:
         """float64 [3, 9]: spherical harmonics in the map's own space."""
         return harmonics.project(self.pixels)
 
-    def on(self, device: wp.Device) -> tuple[wp.array, ...]:
-        """Return texels and alias table on the device."""
+    def on(self, device: wp.Device) -> tuple[wp.array, wp.array, float]:
+        """Return texels, alias table and scale of densities, arrays on the device."""
         if device.alias not in self.arrays:
-            table = AliasTable.build(_cell_weights(self.pixels))
+            weights = _patch_weights(self.pixels)
             texels = on_device(self.pixels.reshape(-1, 3), wp.vec3, device)
-            self.arrays[device.alias] = (texels, table.on(device))
+            self.arrays[device.alias] = (texels, AliasTable.build(weights).on(device), 1.0 / weights.sum())
         return self.arrays[device.alias]
 
 
-def _cell_weights(pixels: np.ndarray) -> np.ndarray:
-    """Return float64 [height, width]: mean luminance of each cell around a node times the cell's solid angle.
+def _patch_weights(pixels: np.ndarray) -> np.ndarray:
+    """Return float64 [height - 1, width]: mean luminance between four nodes times the patch's solid angle, nearly.
 
-    The mean is that of the bilinear interpolant, so a cell's weight is positive wherever its radiance is.
+    Steradians are those in the middle of the row, where ``environment.patch_pdf`` counts the same.
     """
     height, width = pixels.shape[:2]
     value = pixels.astype(np.float64) @ LUMINANCE
-    value = 0.75 * value + 0.125 * (np.roll(value, 1, 1) + np.roll(value, -1, 1))
-    mean = 0.75 * value
-    mean[1:-1] += 0.125 * (value[:-2] + value[2:])
-    mean[0] += 0.25 * value[1]
-    mean[-1] += 0.25 * value[-2]
-    edges = (np.clip(np.arange(height + 1) - 0.5, 0, height - 1)) * (math.pi / (height - 1))
-    half_step = 0.5 * np.diff(edges)
-    area = 4 * math.pi / width * np.sin(0.5 * (edges[1:] + edges[:-1])) * np.sin(half_step)
-    return mean * area[:, None]
+    value = 0.5 * (value + np.roll(value, -1, 1))
+    step = math.pi / (height - 1)
+    area = np.sin((np.arange(height - 1) + 0.5) * step) * step * (2 * math.pi / width)
+    return 0.5 * (value[:-1] + value[1:]) * area[:, None]
 
 
 @dataclass(eq=False)
@@ -199,7 +194,7 @@ class Environment:
             result.radiance = wp.vec3(self.scale, self.scale, self.scale)
             result.height, result.width = self._map.pixels.shape[:2]
             arrays = self._map.on(target)
-            result.texels, result.alias = arrays
+            result.texels, result.alias, result.pdf_scale = arrays
         return result
 
 

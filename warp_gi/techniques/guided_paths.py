@@ -82,6 +82,7 @@ class GuidedPaths(BsdfPaths):
         data = guided_directions.GuidedDirections()
         data.bits, data.stratified = self.bits, int(self.stratified)
         data.trees, data.shares, data.counts = state.guides.trees, state.guides.shares, state.counts
+        data.anchors = state.guides.anchors
         frame.directions = SamplerInUse(guided_directions.GUIDED_DIRECTIONS, data)
         return state
 
@@ -94,15 +95,17 @@ class GuidedPaths(BsdfPaths):
             )
         guides = _guides(lesson.octree.leaf_count, self.bits, device)
         uniform = wp.vec4ui(*quadtree.quadtree_uniform(self.bits))
-        inputs = [lesson.origins, state.guides, guides, uniform, self.bsdf_share]
+        cells = [lesson.octree.octree, lesson.tree]
+        inputs = [lesson.origins, state.guides, guides, uniform, self.bsdf_share, *cells]
         lesson.launch(guided_shares.take_over_guides, inputs)
         samples = lesson.leaf_samples(self.samples)
-        if self.adapts_share:
-            lesson.launch(guided_shares.adapt_shares, [samples, lesson.records, guides, self.bsdf_share])
+        inputs = [samples, lesson.records, guides, *cells, self.bsdf_share, int(self.adapts_share)]
+        lesson.launch(guided_shares.adapt_shares, inputs)
         adaptation = self._adaptation(guides, device)
+        adaptation.octree = lesson.octree.octree
         records = quadtree_adapt.QuadtreeSamples()
         records.starts, records.counts, records.order = samples.starts, samples.counts, samples.order
-        for name in ("directions", "contributions", "pdfs"):
+        for name in ("codes", "directions", "contributions", "pdfs"):
             setattr(records, name, getattr(lesson.records, name))
         lesson.launch(quadtree_adapt.adapt_quadtrees, [records, adaptation])
         return GuideState(guides, adaptation.counts)
@@ -112,7 +115,7 @@ class GuidedPaths(BsdfPaths):
         adaptation = quadtree_adapt.QuadtreeAdaptation()
         adaptation.bits, adaptation.migrations = self.bits, self.migrations
         adaptation.significance, adaptation.most_samples = self.significance, self.samples
-        adaptation.trees = guides.trees
+        adaptation.trees, adaptation.anchors = guides.trees, guides.anchors
         adaptation.counts = wp.empty(leaves * self.bits // 4, dtype=wp.uint32, device=device)
         adaptation.energies, adaptation.fading = guides.energies, self.fading
         return adaptation
@@ -141,5 +144,7 @@ def _guides(leaves: int, bits: int, device: wp.Device) -> guided_shares.GuideKno
     guides.trees = wp.empty(leaves, dtype=wp.vec4ui, device=device)
     guides.shares = wp.empty(leaves, dtype=wp.vec2, device=device)
     guides.moments = wp.zeros(2 * leaves, dtype=guided_shares.ShareMoments, device=device)
+    guides.anchors = wp.zeros(leaves, dtype=wp.vec4, device=device)
+    guides.nearness = wp.zeros(leaves, dtype=wp.vec2, device=device)
     guides.energies = wp.zeros(leaves * 4 * bits, dtype=wp.float32, device=device)
     return guides

@@ -18,6 +18,7 @@ from warp_gi.techniques.ltc import ltc_table
 from warp_gi.techniques.sample_octree import Lesson, running_sums
 
 EXPLORES_BY = ("hierarchy", "table")
+LEAST_EXPLORATION, MOST_EXPLORATION = 0.05, 0.75
 MOVING_EXPLORATION = 0.3  # least share in a frame whose lights are not where they were
 MOST_EMITTERS = 1 << 23  # entries of lists have 23 bits for them
 
@@ -111,7 +112,8 @@ class VisibilityLightCache(Estimator):
             state = replace(state, places=places, shapes=shapes, emitters=emitters.emitters)
         if moved.any() and self.adapts_exploration:  # what is known is in doubt
             tables = launch.copied(state.tables, light_cache.CacheTables)
-            shares = np.maximum(tables.exploration.numpy(), np.float32(max(self.exploration, MOVING_EXPLORATION)))
+            least = min(max(self.exploration, MOVING_EXPLORATION), MOST_EXPLORATION)
+            shares = np.maximum(tables.exploration.numpy(), np.float32(least))
             tables.exploration = launch.on_device(shares, wp.float32, device)
             state = replace(state, tables=tables)
         cache = light_cache.LightCache()
@@ -148,6 +150,9 @@ class VisibilityLightCache(Estimator):
         settings = light_cache_build.CacheSettings()
         settings.capacity = self.capacity
         settings.hysteresis = 0.75
+        settings.first_exploration = self.exploration
+        adapted = (LEAST_EXPLORATION, MOST_EXPLORATION) if self.adapts_exploration else (self.exploration,) * 2
+        settings.least_exploration, settings.most_exploration = adapted
         samples, origins = lesson.leaf_samples(self.samples), lesson.origins
 
         seen = _lists(leaves, device)
@@ -158,7 +163,11 @@ class VisibilityLightCache(Estimator):
         lesson.launch(light_cache_build.bound_lists, [*around, joined.counts])
         joined.offsets, size = running_sums(joined.counts)
         joined.entries = wp.zeros(size, dtype=wp.int32, device=device)
+        joined.tries = wp.zeros(size, dtype=wp.vec2, device=device)
         lesson.launch(light_cache_build.join_lights, [*around, joined, self.memory])
+        tables, sizes = _tables(leaves, device, self.exploration), wp.empty(leaves, dtype=wp.int32, device=device)
+        inputs = [settings, samples, lesson.records, joined, origins, state.tables, tables]
+        lesson.launch(light_cache_build.weigh_light_samples, inputs)
 
         lights = light_cache.LightCache()
         lights.shapes, lights.emitters = state.shapes, state.emitters
@@ -167,16 +176,13 @@ class VisibilityLightCache(Estimator):
         octree = lesson.octree.octree
         inputs = [lights, octree, lesson.tree, joined, self.capacity, importances, sums]
         lesson.launch(light_cache_build.rank_lights, inputs)
-        tables, sizes = _tables(leaves, device, self.exploration), wp.empty(leaves, dtype=wp.int32, device=device)
         inputs = [settings, joined, importances, origins, state.tables.buckets, tables.buckets, sizes]
         lesson.launch(light_cache_build.count_buckets, inputs)
         tables.offsets, size = running_sums(sizes)
         tables.items = wp.zeros(size, dtype=wp.int32, device=device)
+        tables.rates = wp.zeros(size, dtype=wp.float32, device=device)
         tables.chances = wp.zeros(size, dtype=wp.float32, device=device)
         lesson.launch(light_cache_build.fill_buckets, [settings, joined, importances, sums, tables])
-        if self.adapts_exploration:
-            inputs = [samples, lesson.records, origins, state.tables, tables, self.exploration]
-            lesson.launch(light_cache_build.adapt_exploration, inputs)
         return replace(state, tables=tables, known=joined)
 
 
@@ -204,9 +210,10 @@ def _tables(leaves: int, device: wp.Device, exploration: float) -> light_cache.C
     tables.buckets = wp.zeros(leaves, dtype=wp.int32, device=device)
     tables.offsets = wp.zeros(leaves, dtype=wp.int32, device=device)
     tables.items = wp.zeros(0, dtype=wp.int32, device=device)
+    tables.rates = wp.zeros(0, dtype=wp.float32, device=device)
     tables.chances = wp.zeros(0, dtype=wp.float32, device=device)
     tables.exploration = wp.full(leaves, exploration, dtype=wp.float32, device=device)
-    tables.moments = wp.zeros(leaves, dtype=light_cache.ExplorationMoments, device=device)
+    tables.moments = wp.zeros(leaves, dtype=wp.vec2, device=device)
     return tables
 
 
@@ -215,6 +222,7 @@ def _lists(leaves: int, device: wp.Device) -> light_cache_build.LightLists:
     lists.offsets = wp.zeros(leaves, dtype=wp.int32, device=device)
     lists.counts = wp.zeros(leaves, dtype=wp.int32, device=device)
     lists.entries = wp.zeros(0, dtype=wp.int32, device=device)
+    lists.tries = wp.zeros(0, dtype=wp.vec2, device=device)
     return lists
 
 
