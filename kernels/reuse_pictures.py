@@ -10,8 +10,9 @@ from warp_gi.kernels.bsdf import luminance
 from warp_gi.kernels.bvh import bvh_intersect
 from warp_gi.kernels.environment import environment_radiance
 from warp_gi.kernels.gbuffer import CameraData, camera_ray
-from warp_gi.kernels.octahedral import octahedral_decode
+from warp_gi.kernels.octahedral import octahedral_decode, octahedral_encode
 from warp_gi.kernels.octree import Octree, cell_code, octree_leaf
+from warp_gi.kernels.parallax import seen_from_anchor
 from warp_gi.kernels.path_trace import (
     TERM_EMITTERS,
     TERM_ENVIRONMENT,
@@ -104,12 +105,15 @@ def map_incident_light(first: wp.int32, scene: SceneData, incident: IncidentMap)
     incident.light[texel] = total / wp.float32(incident.rays)
 
 
-# Thread: a pixel of an octahedral map. The density [1/sr] of the direction in its middle, and the quadtree's leaf.
+# Thread: a pixel of an octahedral map. The density [1/sr] of the direction in its middle, of a region's tree at a
+# position, and the quadtree's leaf.
 @wp.kernel
 def map_quadtree(
     first: wp.int32,
     tree: wp.vec4ui,
     bits: wp.int32,
+    anchor: wp.vec4,
+    position: wp.vec3,
     resolution: wp.int32,
     densities: wp.array(dtype=wp.float32),
     leaves: wp.array(dtype=wp.int32),
@@ -118,5 +122,6 @@ def map_quadtree(
     row = pixel / resolution
     column = pixel - row * resolution
     uv = wp.vec2(wp.float32(column) + 0.5, wp.float32(row) + 0.5) / wp.float32(resolution)
-    densities[pixel] = quadtree_pdf(tree, bits, octahedral_decode(uv))
-    leaves[pixel] = quadtree_locate(tree, bits, uv).node
+    seen = seen_from_anchor(anchor, position, octahedral_decode(uv))
+    densities[pixel] = quadtree_pdf(tree, bits, seen.direction) * seen.stretch
+    leaves[pixel] = quadtree_locate(tree, bits, octahedral_encode(seen.direction)).node

@@ -14,7 +14,6 @@ from warp_gi.errors import OptionError, SceneError
 from warp_gi.kernels.alias import alias_choice, alias_position
 from warp_gi.kernels.environment import (
     environment_lookup,
-    environment_pdf,
     environment_radiance,
     environment_sample,
     lat_long_decode,
@@ -40,7 +39,7 @@ def sample_directions(
     i = first + wp.tid()
     s = environment_sample(env, numbers[i])
     directions[i] = s.direction
-    radiance[i] = environment_lookup(env, s.direction).radiance
+    radiance[i] = s.radiance
     pdf[i] = s.pdf
 
 
@@ -50,11 +49,14 @@ def look_up(
     env: EnvironmentData,
     directions: wp.array(dtype=wp.vec3),
     radiance: wp.array(dtype=wp.vec3),
+    alone: wp.array(dtype=wp.vec3),
     pdf: wp.array(dtype=wp.float32),
 ):
     i = first + wp.tid()
-    radiance[i] = environment_radiance(env, directions[i])
-    pdf[i] = environment_pdf(env, directions[i])
+    looked_up = environment_lookup(env, directions[i])
+    radiance[i] = looked_up.radiance
+    alone[i] = environment_radiance(env, directions[i])
+    pdf[i] = looked_up.pdf
 
 
 @wp.kernel
@@ -88,9 +90,10 @@ def place(first: wp.int32, count: wp.int32, numbers: wp.array(dtype=wp.vec2), po
 
 def evaluate(env: Environment, directions: np.ndarray, device: str = "cpu") -> tuple[np.ndarray, np.ndarray]:
     points = wp.array(directions.astype(np.float32), dtype=wp.vec3, device=device)
-    radiance = wp.zeros(len(directions), dtype=wp.vec3, device=device)
+    radiance, alone = (wp.zeros(len(directions), dtype=wp.vec3, device=device) for _ in range(2))
     pdf = wp.zeros(len(directions), dtype=wp.float32, device=device)
-    launch.launch(look_up, len(directions), [env.data(device), points, radiance, pdf], wp.get_device(device))
+    launch.launch(look_up, len(directions), [env.data(device), points, radiance, alone, pdf], wp.get_device(device))
+    assert np.array_equal(radiance.numpy(), alone.numpy())
     return radiance.numpy(), pdf.numpy()
 
 
@@ -118,23 +121,64 @@ def spotted_map(height: int) -> np.ndarray:
     return pixels
 
 
-def row_edges(height: int) -> np.ndarray:
-    """Polar angles between cells of rows: nodes stand at both poles."""
-    return np.clip(np.arange(height + 1) - 0.5, 0, height - 1) * math.pi / (height - 1)
+def black_map(height: int, *bright: tuple[int, int]) -> np.ndarray:
+    """Black but for single bright texels."""
+    pixels = np.zeros((height, 2 * height, 3), np.float32)
+    for row, column in bright:
+        pixels[row, column] = 3.0, 7.0, 1.0
+    return pixels
 
 
-def sphere_grid(env: Environment, parts: int = 4) -> tuple[np.ndarray, np.ndarray]:
-    """Midpoints (in azimuth and cosine) and solid angles of parts x parts pieces of every cell, world space."""
+def angles_of(env: Environment, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Polar angle and azimuth in [0, 2 pi) in the sky's own space, float64."""
+    local = directions.astype(np.float64) @ env.world_from_environment
+    theta = np.arctan2(np.hypot(local[:, 0], local[:, 2]), local[:, 1])
+    return theta, np.arctan2(local[:, 0], -local[:, 2]) % (2 * math.pi)
+
+
+def sphere_grid(env: Environment, parts: int = 8) -> tuple[np.ndarray, np.ndarray]:
+    """Midpoints and solid angles of parts x parts pieces of every patch between four nodes, world space.
+
+    In latitude and longitude the pieces are equal, and begin at the first node. There the density is bilinear, so
+    midpoints integrate it exactly, piece by piece.
+    """
     height, width = env.pixels.shape[:2]
-    cos_edges = np.cos(row_edges(height))
-    low, high = cos_edges[:-1, None], cos_edges[1:, None]
-    y = (low + (high - low) * (np.arange(parts) + 0.5) / parts).ravel()
-    phi = (np.arange(width * parts) + 0.5) / (width * parts) * 2 * math.pi
-    weight = np.repeat((cos_edges[:-1] - cos_edges[1:]) / parts, parts) * 2 * math.pi / (width * parts)
-    y, phi, weight = (g.ravel() for g in (*np.meshgrid(y, phi, indexing="ij"), np.repeat(weight, width * parts)))
-    r = np.sqrt(1 - y * y)
-    local = np.stack([r * np.sin(phi), y, -r * np.cos(phi)], axis=-1)
-    return local @ env.world_from_environment.T, weight
+    d_theta, d_phi = math.pi / ((height - 1) * parts), 2 * math.pi / (width * parts)
+    theta = (np.arange((height - 1) * parts) + 0.5) * d_theta
+    phi = (0.5 * parts + np.arange(width * parts) + 0.5) * d_phi
+    theta, phi = (g.ravel() for g in np.meshgrid(theta, phi, indexing="ij"))
+    local = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=-1)
+    return local @ env.world_from_environment.T, np.sin(theta) * d_theta * d_phi
+
+
+def count_in_grid(env: Environment, directions: np.ndarray, parts: int) -> np.ndarray:
+    """How many directions are in each piece of `sphere_grid`, [row of patches, part, column, part]."""
+    height, width = env.pixels.shape[:2]
+    theta, phi = angles_of(env, directions)
+    row = np.minimum((theta / math.pi * (height - 1) * parts).astype(int), (height - 1) * parts - 1)
+    column = np.floor((phi / (2 * math.pi) * width - 0.5) * parts).astype(int) % (width * parts)
+    counts = np.bincount(row * width * parts + column, minlength=(height - 1) * width * parts**2)
+    return counts.reshape(height - 1, parts, width, parts)
+
+
+def expected_pdf(env: Environment, directions: np.ndarray) -> np.ndarray:
+    """The density [1/sr] in float64: bilinear luminance, times the sine in the middle of a row over that here."""
+    luminance = env.pixels.astype(np.float64) @ [0.2126, 0.7152, 0.0722]
+    height, width = luminance.shape
+    middles = np.sin((np.arange(height - 1) + 0.5) * math.pi / (height - 1))
+    total = 0.0
+    for i in range(height - 1):
+        for j in range(width):
+            corners = [luminance[i + k, (j + m) % width] for k in range(2) for m in range(2)]
+            total += np.mean(corners) * middles[i] * (math.pi / (height - 1)) * (2 * math.pi / width)
+    theta, phi = angles_of(env, directions)
+    x, y = phi / (2 * math.pi) * width - 0.5, theta / math.pi * (height - 1)
+    i, j = np.minimum(y.astype(int), height - 2), np.floor(x).astype(int)
+    upper, lower = (
+        luminance[i + k, j % width] * (1 - x + j) + luminance[i + k, (j + 1) % width] * (x - j) for k in range(2)
+    )
+    value = upper * (1 - y + i) + lower * (y - i)
+    return value * middles[i] / (total * np.sin(theta))
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -191,27 +235,32 @@ def test_alias_table_refuses_bad_weights():
     assert np.allclose(AliasTable.build(np.zeros(5)).pdf, 0.2)
 
 
+MAPS = {
+    "spotted": lambda: spotted_map(12),
+    "lowest": lambda: spotted_map(2),
+    "a texel at the seam": lambda: black_map(9, (4, 17)),
+    "another at the seam": lambda: black_map(9, (4, 0)),
+    "a texel at each pole": lambda: black_map(8, (0, 5), (7, 0)),
+    "grey": lambda: np.full((6, 12, 3), 0.5, np.float32),
+}
+
+
 @pytest.mark.parametrize("device", DEVICES)
-def test_map_samples_follow_the_pdf_inside_every_cell(device):
-    env = Environment(pixels=spotted_map(12), rotation=37.0)
-    height, width = env.pixels.shape[:2]
-    parts, count = 3, 1_500_000
-    directions, _, _ = sample(env, count, device)
-    local = directions.astype(np.float64) @ env.world_from_environment
-    theta = np.arctan2(np.hypot(local[:, 0], local[:, 2]), local[:, 1])
-    u = np.arctan2(local[:, 0], -local[:, 2]) / (2 * math.pi) % 1
-    edges = row_edges(height)
-    row = np.clip(np.searchsorted(edges, theta) - 1, 0, height - 1)
-    up, down = np.cos(edges[row]), np.cos(edges[row + 1])
-    part = np.clip(((up - np.cos(theta)) / (up - down) * parts).astype(int), 0, parts - 1)
-    column = np.minimum((u * width * parts).astype(int), width * parts - 1)
-    counts = np.bincount((row * parts + part) * width * parts + column, minlength=height * width * parts**2)
+@pytest.mark.parametrize("name", MAPS)
+def test_map_samples_follow_the_pdf_inside_every_patch(name, device):
+    env = Environment(pixels=MAPS[name](), rotation=37.0)
+    parts, count = 4, 1_500_000
+    counts = count_in_grid(env, sample(env, count, device)[0], parts)
     points, areas = sphere_grid(env, parts)
     _, pdf = evaluate(env, points, device)
-    expected = pdf.astype(np.float64) * areas * count
-    inside = expected > 1e-3 * expected.mean()  # float32 lets a few samples of a bright cell cross its edge
-    assert counts[~inside].sum() < 1e-5 * count
-    assert chi_squared(counts[inside], expected[inside]) > 1e-4
+    expected = (pdf.astype(np.float64) * areas * count).reshape(counts.shape)
+    assert np.isclose(expected.sum(), count, rtol=1e-5)
+    # all of them; rows at the poles; patches at the seam. Black patches get none
+    for part in (np.s_[:], np.s_[[0, -1]], np.s_[:, :, [0, -1]]):
+        assert chi_squared(counts[part], expected[part]) > 1e-4
+    black = expected == 0
+    assert black.any() == (name not in ("grey", "lowest"))
+    assert not counts[black].any()
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -236,13 +285,76 @@ def test_a_black_sky_yields_nothing():
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("height", [2, 3, 12, 64])
-def test_pdf_integrates_to_one_and_covers_all_radiance(height, device):
-    env = Environment(pixels=spotted_map(height), rotation=-20.0, scale=2.0)
+@pytest.mark.parametrize("rotation, scale", [(0.0, 1.0), (-20.0, 2.0), (200.0, 0.01)])
+def test_pdf_integrates_to_one_and_covers_all_radiance(rotation, scale, height, device):
+    env = Environment(pixels=spotted_map(height), rotation=rotation, scale=scale)
     points, areas = sphere_grid(env)
     radiance, pdf = evaluate(env, points, device)
-    assert abs(pdf.astype(np.float64) @ areas - 1) < 1e-4
-    assert (pdf[radiance.max(1) > 0] > 0).all()
-    assert np.allclose(radiance.T.astype(np.float64) @ areas / (4 * math.pi), env.mean_radiance, rtol=0.02)
+    assert abs(pdf.astype(np.float64) @ areas - 1) < 1e-5
+    assert np.array_equal(pdf > 0, radiance.max(1) > 0)
+    assert np.allclose(radiance.T.astype(np.float64) @ areas / (4 * math.pi), env.mean_radiance, rtol=0.01)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("height", [2, 3, 12, 64])
+def test_pdf_is_that_of_the_interpolated_luminance(height, device):
+    env = Environment(pixels=spotted_map(height), rotation=-20.0, scale=3.0)
+    step = math.pi / (height - 1)
+    theta = np.repeat([1e-3 * step, 0.3 * step, math.pi - 0.3 * step, math.pi - 1e-3 * step], 500)
+    phi = np.tile(np.linspace(0, 2 * math.pi, 500), 4)
+    poles = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=-1)
+    directions = np.concatenate([random_directions(20_000), poles]).astype(np.float32)
+    _, pdf = evaluate(env, directions, device)
+    expected = expected_pdf(env, directions)
+    # float32 tells places in the map apart by 1e-7 of its side, over which the luminance changes by that much
+    sine = np.sin(angles_of(env, directions)[0])
+    steepest = height * expected_pdf(env, sphere_grid(env, 2)[0]).max()
+    assert np.all(np.abs(pdf - expected) < 1e-5 * expected + 1e-6 * steepest / sine)
+    assert (expected > 0).mean() > 0.5
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("name", MAPS)
+def test_samples_say_what_a_look_up_says(name, device):
+    env = Environment(pixels=MAPS[name](), rotation=100.0, scale=2.5)
+    directions, radiance, pdf = sample(env, 200_000, device)
+    assert np.abs(np.linalg.norm(directions.astype(np.float64), axis=1) - 1).max() < 1e-6
+    looked_up, again = evaluate(env, directions, device)
+    assert pdf.min() > 0
+    assert np.allclose(radiance, looked_up, rtol=1e-4, atol=1e-5 * radiance.max())
+    sine = np.sin(angles_of(env, directions)[0])
+    assert np.allclose(pdf * sine, again * sine, rtol=1e-4, atol=1e-5 * (pdf * sine).max())
+
+
+@pytest.mark.parametrize("height", [2, 12, 64])
+def test_weights_vary_by_sines_only(height):
+    """Luminance over pdf is its integral, times the sine here over that in the middle of the row."""
+    env = Environment(pixels=spotted_map(height), rotation=10.0)
+    directions, radiance, pdf = sample(env, 200_000)
+    weights = radiance.astype(np.float64) @ [0.2126, 0.7152, 0.0722] / pdf
+    theta, _ = angles_of(env, directions)
+    row = theta / math.pi * (height - 1)
+    middle = np.sin((np.floor(row) + 0.5) * math.pi / (height - 1))
+    inside = np.abs(row - np.round(row)) > 1e-4  # float32 may tell them to be in the other row
+    ratio = (weights * middle / np.sin(theta))[inside]
+    assert inside.mean() > 0.99 and np.ptp(ratio) < 2e-5 * ratio.mean()
+    assert np.isclose(ratio.mean(), env.mean_radiance @ [0.2126, 0.7152, 0.0722] * 4 * math.pi, rtol=2 / height)
+
+
+@pytest.mark.parametrize("elevation", [8.0, 30.0, 75.0])
+def test_the_sun_s_irradiance_varies_as_much_as_a_choice_must(elevation):
+    """Samples that go to the sun all bring nearly the same, so the variance is that of how many do: binomial."""
+    sky = SunSky(elevation=elevation, azimuth=123.0, height=256)
+    env = as_environment(sky)
+    directions, radiance, pdf = sample(env, 200_000)
+    near = directions @ sky.direction > math.cos(math.radians(2.0))
+    sun = near & (radiance[:, 1] > 20 * replace(sky, sun_intensity=0.0).pixels()[:, :, 1].max())
+    share = sun.mean()
+    assert 0.3 < share < 0.95
+    irradiance = np.where(sun, radiance[:, 1] / pdf * directions[:, 1], 0).astype(np.float64)
+    assert np.isclose(irradiance.mean(), sky.sun_irradiance[1] * sky.direction[1], rtol=0.05)
+    relative = irradiance.var() / irradiance.mean() ** 2
+    assert 1 - 1e-6 < relative / ((1 - share) / share) < 1.01
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -250,15 +362,11 @@ def test_pdf_integrates_to_one_and_covers_all_radiance(height, device):
 def test_sampled_flux_equals_the_integral(kind, device):
     sky = SunSky(elevation=30.0, azimuth=77.0, height=128) if kind == "sun" else Environment(pixels=spotted_map(32))
     env = as_environment(sky).rotated(15.0)
-    directions, radiance, pdf = sample(env, 400_000, device)
+    _, radiance, pdf = sample(env, 400_000, device)
     estimate = radiance / pdf[:, None] / (4 * math.pi)
     error = estimate.std(0, dtype=np.float64) / math.sqrt(len(estimate))
     assert np.all(np.abs(estimate.mean(0, dtype=np.float64) - env.mean_radiance) < 4.5 * error)
-    assert np.all(error < 0.01 * env.mean_radiance)  # a uniform choice would be off by far more
-    radiance_again, pdf_again = evaluate(env, directions, device)
-    scale = radiance.max()
-    assert np.mean(np.abs(pdf_again - pdf) > 1e-4 * pdf) < 1e-3  # at the edges of cells they may differ
-    assert np.abs(radiance_again - radiance).max() < 1e-3 * scale
+    assert np.all(error < 0.002 * env.mean_radiance)  # a uniform choice would be off by far more
 
 
 def test_rotation_turns_counter_clockwise_seen_from_above():

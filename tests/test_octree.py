@@ -39,6 +39,14 @@ def encode_points(
 
 
 @wp.kernel
+def decode_codes(
+    first: wp.int32, tree: octree.Octree, codes: wp.array(dtype=wp.uint32), points: wp.array(dtype=wp.vec3)
+):
+    i = first + wp.tid()
+    points[i] = octree.code_position(tree, codes[i])
+
+
+@wp.kernel
 def find_leaves(
     first: wp.int32,
     nodes: wp.array(dtype=wp.uint32),
@@ -288,6 +296,17 @@ def test_codes_of_points():
     corners = separated(encoded(np.array([LOW, HIGH], np.float32), cube))
     assert corners[0, 0] == 0 and corners[1, 0] == SIDE - 1  # along the longest edge the scene fills the cube
     assert abs(corners[:, 1:].mean(axis=0) - (SIDE - 1) / 2).max() <= 1.0  # and is in its middle along the others
+
+
+def test_places_of_codes():
+    """The middle of the finest cell, whose code is the same."""
+    cube = start().octree
+    codes = np.append(np.random.default_rng(2).integers(0, CODES, 20_000), [0, 1, 2, 4, CODES - 1])
+    points = wp.empty(len(codes), dtype=wp.vec3, device=device())
+    launch(decode_codes, len(codes), [cube, wp.array(codes, dtype=wp.uint32, device=device()), points], device())
+    expected = (separated(codes) + 0.5) / cube.scale + np.array(cube.low)
+    assert np.abs(points.numpy() - expected).max() < 1e-3 / cube.scale
+    assert np.array_equal(encoded(points.numpy(), cube), codes)
 
 
 def test_first_tree_is_eight_leaves():
@@ -547,7 +566,8 @@ def test_each_recorded_path_has_its_own_slots(resolution, spp, vertices, most):
     size = records.codes.shape[0]
     assert size < most + vertices and size % vertices == 0
     assert records.stride == 1 or size * records.stride > most - vertices, "thinned more than needed"
-    for name in ("lights", "directions", "contributions", "pdfs", "mixtures"):
+    names = ("lights", "light_values", "directions", "contributions", "pdfs", "mixtures", "nearness", "carried")
+    for name in names:
         assert getattr(records, name).shape[0] == size
     assert (records.codes.numpy() == EMPTY).all()
     slots = slots_of(records, paths)

@@ -10,6 +10,7 @@ from functools import cache
 import numpy as np
 import pytest
 import warp as wp
+from parallax_tools import has_parallax, seen_from_anchor, unit
 from scipy.stats import qmc
 from statistics_tools import chi_squared, device, every_device, sphere_expectation, sphere_histogram  # noqa: F401
 
@@ -159,12 +160,14 @@ def evaluate(
     density: wp.array(dtype=wp.float32),
     packed: wp.array(dtype=wp.uint32),
     uvs: wp.array(dtype=wp.vec2),
+    unpacked: wp.array(dtype=wp.vec3),
 ):
     i = first + wp.tid()
     pdf[i] = quadtree.quadtree_pdf(tree, bits, directions[i])
     density[i] = quadtree.octahedral_density(directions[i])
     packed[i] = quadtree_adapt.quadtree_pack_direction(directions[i])
     uvs[i] = octahedral.octahedral_encode(directions[i])
+    unpacked[i] = quadtree_adapt.quadtree_unpack_direction(packed[i])
 
 
 # ---- oracle: a tree is the set of its inner cells (level, column, row), of which (0, 0, 0) is always one ----
@@ -304,7 +307,8 @@ def chosen(values, sign):
 def adapted(number, bits, energies, record, migrations, significance, fading):
     """The tree after one frame, and energies [quadrant] of its leaves by cell (as ``energies``, before), in float64.
 
-    ``record``: packed directions, contributions, densities per sr. Of each sample c^2 p, p over the square, counts.
+    ``record``: packed directions, contributions, densities per sr, as seen from the anchor. Of each sample c^2 p, p
+    over the square, counts.
     """
     cells, inner = decoded(number, bits)
     packed, contributions, pdfs = record
@@ -361,16 +365,12 @@ def oracle_density(directions):
 
 def differenced_density(directions):
     """Of the octahedral map, 1 / |(d direction / du) x (d direction / dv)|, by differences in float64."""
-    d = np.asarray(directions, np.float64)
-    q = d / np.abs(d).sum(axis=-1, keepdims=True)
-    lower = q[:, 1] < 0
-    x = np.where(lower, np.where(q[:, 0] < 0, -1, 1) * (1 - np.abs(q[:, 2])), q[:, 0])
-    z = np.where(lower, np.where(q[:, 2] < 0, -1, 1) * (1 - np.abs(q[:, 0])), q[:, 2])
+    u, v = octahedral_of(np.asarray(directions, np.float64)).T
+    h = 1e-6
 
     def direction(u, v):
         return decoded_directions(np.stack([u, v], axis=-1))
 
-    u, v, h = (x + 1) / 2, (z + 1) / 2, 1e-6
     du = (direction(u + h, v) - direction(u - h, v)) / (2 * h)
     dv = (direction(u, v + h) - direction(u, v - h)) / (2 * h)
     return 1 / np.linalg.norm(np.cross(du, dv), axis=-1)
@@ -404,9 +404,9 @@ def drawn(number, bits, numbers):
 
 
 def evaluated(number, bits, directions):
-    """pdf, octahedral_density, packed directions and octahedral coordinates."""
+    """pdf, octahedral_density, packed directions, octahedral coordinates and the packed directions unpacked."""
     n = len(directions)
-    outputs = [empty(n, t) for t in (wp.float32, wp.float32, wp.uint32, wp.vec2)]
+    outputs = [empty(n, t) for t in (wp.float32, wp.float32, wp.uint32, wp.vec2, wp.vec3)]
     tree = wp.vec4ui(*map(int, words([number])[0]))
     launch(evaluate, n, [bits, tree, on_device(directions, wp.vec3), *outputs], device())
     return [output.numpy() for output in outputs]
@@ -420,28 +420,63 @@ def walked(bits, threads, steps):
     return trees.numpy().reshape(threads, steps, 4), moves.numpy().reshape(threads, steps, 2)
 
 
-def adapt(trees, bits, records, migrations=1, most_samples=1 << 30, significance=0.5, fading=0.0, energies=None):
+LOW, SCALE = np.array([-3.0, 1.0, 10.0]), 100.0  # corner of the octree's cube, its finest cells per metre
+
+
+def positions_of(codes):
+    """Middles float64 [n, 3] of the finest cells of an octree."""
+    codes = np.asarray(codes, np.int64)
+    places = [sum((codes >> (3 * bit + axis) & 1) << bit for bit in range(10)) for axis in range(3)]
+    return (np.stack(places, axis=-1) + 0.5) / SCALE + LOW
+
+
+def from_anchor(record, anchor):
+    """What `adapted` takes, of a record that has codes of positions: directions and densities at the anchor."""
+    packed, contributions, pdfs, codes = record
+    anchor = np.asarray(anchor, np.float64)
+    seen, stretch = seen_from_anchor(anchor, positions_of(codes), decoded_directions(uv_of(packed) + 0.5 / 65536))
+    return packed_of(octahedral_of(seen)), contributions, pdfs / stretch
+
+
+def octahedral_of(directions):
+    """Points of the octahedral map of directions, float64."""
+    q = directions / np.abs(directions).sum(axis=-1, keepdims=True)
+    x, z, lower = q[:, 0], q[:, 2], q[:, 1] < 0
+    u = np.where(lower, np.where(x < 0, -1, 1) * (1 - np.abs(z)), x)
+    v = np.where(lower, np.where(z < 0, -1, 1) * (1 - np.abs(x)), z)
+    return np.stack([u + 1, v + 1], axis=-1) / 2
+
+
+def adapt(
+    trees, bits, records, migrations=1, most_samples=1 << 30, significance=0.5, fading=0.0, energies=None, anchors=None
+):
     """Trees [leaf, 4], counts and energies [leaf, node, quadrant] after one frame; ``energies``: before, none are 0.
 
-    ``records`` is [leaf] of (packed directions, contributions, densities per sr).
+    ``records`` is [leaf] of (packed directions, contributions, densities per sr) and, with ``anchors`` [leaf, 4],
+    codes of positions.
     """
+    if anchors is None:  # positions do not matter then
+        anchors = np.zeros((len(trees), 4))
+        records = [(*record[:3], np.full(len(record[0]), 7)) for record in records]
     lengths = np.array([len(record[0]) for record in records], np.int32)
     total = int(lengths.sum())
     order = np.random.default_rng(3).permutation(total).astype(np.int32)
-    columns = [np.zeros(total + 1, dtype) for dtype in (np.uint32, np.float32, np.float32)]
+    columns = [np.zeros(total + 1, dtype) for dtype in (np.uint32, np.float32, np.float32, np.uint32)]
     for i, column in enumerate(columns):
         column[order] = np.concatenate([record[i] for record in records])
     samples = quadtree_adapt.QuadtreeSamples()
     samples.starts = on_device((np.cumsum(lengths) - lengths).astype(np.int32), wp.int32)
     samples.counts = on_device(lengths, wp.int32)
     samples.order = on_device(np.append(order, 0), wp.int32)
-    samples.directions = on_device(columns[0], wp.uint32)
-    samples.contributions, samples.pdfs = (on_device(column, wp.float32) for column in columns[1:])
+    samples.directions, samples.codes = (on_device(columns[k], wp.uint32) for k in (0, 3))
+    samples.contributions, samples.pdfs = (on_device(columns[k], wp.float32) for k in (1, 2))
     adaptation = quadtree_adapt.QuadtreeAdaptation()
     adaptation.bits, adaptation.migrations = bits, migrations
     adaptation.significance, adaptation.fading = significance, fading
     adaptation.most_samples = most_samples
     adaptation.trees = on_device(trees, wp.vec4ui)
+    adaptation.anchors = on_device(np.asarray(anchors, np.float32), wp.vec4)
+    adaptation.octree.low, adaptation.octree.scale = wp.vec3(*LOW), SCALE
     adaptation.counts = empty(len(trees) * bits // 4, wp.uint32)
     if energies is None:
         energies = np.zeros((len(trees), bits, 4))
@@ -612,7 +647,7 @@ def random_directions(count, seed=1):
 
 def test_density_is_the_jacobian():
     directions = random_directions(5000)
-    _, density, _, _ = evaluated(random_trees(64, 2)[0], 64, directions)
+    density = evaluated(random_trees(64, 2)[0], 64, directions)[1]
     expected = differenced_density(directions)
     smooth = np.abs(directions).min(axis=1) > 1e-4  # differences do not cross a fold
     assert np.allclose(density[smooth], expected[smooth], rtol=2e-5) and smooth.mean() > 0.99
@@ -629,7 +664,7 @@ def test_pdf(bits):
     ring = np.sqrt(1 - z * z)
     directions = np.stack([ring * np.cos(phi), z, ring * np.sin(phi)], axis=-1).reshape(-1, 3).astype(np.float32)
     for number in random_trees(bits, 6, 6, seed=2):
-        pdf, density, _, uvs = evaluated(number, bits, directions)
+        pdf, density, _, uvs, _ = evaluated(number, bits, directions)
         column, row = np.minimum((uvs * 64).astype(int), 63).T
         expected = 4.0 ** level_grid(number, bits, 6)[row, column] / (3 * bits / 4 + 1)
         assert np.allclose(pdf, expected * density, rtol=1e-5)
@@ -758,8 +793,10 @@ def spot(count, seed=1, sharpness=300.0):
 
 def test_packed_directions():
     directions = np.concatenate([random_directions(5000), np.eye(3), -np.eye(3)]).astype(np.float32)
-    _, _, packed, uvs = evaluated(0xF, 32, directions)
+    _, _, packed, uvs, unpacked = evaluated(0xF, 32, directions)
     assert np.array_equal(packed, packed_of(np.minimum(uvs, 1 - 2.0**-17)))
+    assert np.allclose(unpacked, decoded_directions(uv_of(packed) + 0.5 / 65536), atol=1e-6)
+    assert np.array_equal(evaluated(0xF, 32, unpacked)[2], packed)
 
 
 def random_record(rng, count, spread):
@@ -806,6 +843,80 @@ def test_adaptation_is_that_of_the_oracle(bits, migrations, significance, fading
             assert np.allclose(got[[k for k, _ in leaves]], wanted, rtol=2e-5, atol=1e-12 * wanted.max())
         moved += [len(decoded(a, bits)[1] - decoded(b, bits)[1]) for a, b in zip(numbers, before, strict=True)]
     assert max(moved) == migrations or (migrations == 8 and max(moved) >= 4)
+
+
+def anchored_record(rng, count, anchor):
+    """A `random_record` with codes of positions, most of them within the anchor's sphere, some beyond.
+
+    Seen from the anchor no direction is so near to the border of a code that rounding could move it across.
+    """
+    radius = 1 / anchor[3] if anchor[3] > 0 else 1.0
+    away = unit(rng.standard_normal((4 * count, 3))) * (1.1 * radius * rng.random((4 * count, 1)) ** (1 / 3))
+    places = np.clip((anchor[:3] + away - LOW) * SCALE, 0, 1023).astype(np.int64)
+    codes = sum((places[:, axis] >> bit & 1) << (3 * bit + axis) for bit in range(10) for axis in range(3))
+    record = (*random_record(rng, 4 * count, 0.05), codes)
+    seen, _ = seen_from_anchor(anchor, positions_of(codes), decoded_directions(uv_of(record[0]) + 0.5 / 65536))
+    inside = np.abs(octahedral_of(seen) * 65536 % 1 - 0.5).max(axis=-1) < 0.3
+    assert inside.mean() > 0.3
+    return tuple(column[inside][:count] for column in record)
+
+
+@pytest.mark.parametrize("bits", [32, 128])
+@pytest.mark.parametrize("migrations, fading", [(0, 0.3), (8, 0.8)])
+def test_adaptation_is_as_seen_from_the_anchor(migrations, fading, bits):
+    """Quadrants and densities are those of directions from the anchor's sphere, tree for tree over three frames."""
+    rng = np.random.default_rng([bits, 11])
+    numbers = random_trees(bits, 12, 12, seed=11)
+    anchors = np.column_stack([LOW + rng.uniform(4, 6, (12, 3)), 1 / rng.uniform(0.5, 3, 12)]).astype(np.float32)
+    anchors[3, 3] = 0  # no sphere
+    trees, energies = words(numbers), np.zeros((12, bits, 4))
+    known = [dict.fromkeys(decoded(number, bits)[0], np.zeros(4)) for number in numbers]
+    for _ in range(3):
+        records = [anchored_record(rng, int(rng.integers(1, 400)), anchor) for anchor in anchors.astype(np.float64)]
+        trees, counts, energies = adapt(trees, bits, records, migrations, 300, 0.5, fading, energies, anchors)
+        records = [from_anchor(taken(record, 300), anchor) for record, anchor in zip(records, anchors, strict=True)]
+        pairs = [
+            adapted(number, bits, e, record, migrations, 0.5, fading)
+            for number, e, record in zip(numbers, known, records, strict=True)
+        ]
+        numbers, known = zip(*pairs, strict=True)
+        assert [number_of(tree) for tree in trees] == list(numbers)
+        assert np.array_equal(counts, counts_of(trees, bits).numpy())
+        for number, expected, got in zip(numbers, known, energies, strict=True):
+            leaves = [(k, cell) for k, cell in enumerate(decoded(number, bits)[0]) if cell in expected]
+            wanted = np.array([expected[cell] for _, cell in leaves])
+            assert np.allclose(got[[k for k, _ in leaves]], wanted, rtol=1e-4, atol=1e-12 * wanted.max())
+    # the positions were on both sides of where parallax ends
+    anchor = anchors[0].astype(np.float64)
+    inside = has_parallax(anchor, positions_of(anchored_record(rng, 200, anchor)[3]))
+    assert 0.1 < inside.mean() < 0.9
+
+
+@pytest.mark.parametrize("knows", [True, False])
+def test_points_all_over_a_region_learn_the_same_of_a_lamp(knows):
+    """A lamp on the sphere is in one quadrant of one leaf then, and in many without."""
+    rng = np.random.default_rng(12)
+    lamp = unit(np.array([0.5, 0.6, -0.4]))
+    anchor = np.append(LOW + 5, 0.5)
+    codes = rng.integers(0, 1 << 30, 200_000)
+    away = positions_of(codes) - anchor[:3]
+    codes = codes[np.linalg.norm(away, axis=1) < 1.5]
+    ways = unit(anchor[:3] + lamp / anchor[3] - positions_of(codes))
+    record = (packed_of(octahedral_of(ways)), *np.ones((2, len(codes)), np.float32), codes)
+    number = number_of(quadtree.quadtree_uniform(128))
+    anchor[3] *= knows
+    _, _, energies = adapt(words([number]), 128, [record], 0, anchors=anchor[None])
+    filled = np.argwhere(energies[0] > 0)
+    if not knows:
+        assert len(codes) > 1000 and len(filled) > 20
+        return
+    ((node, quadrant),) = filled
+    level, x, y = decoded(number, 128)[0][node]
+    ((u, v),) = octahedral_of(lamp[None]) * 2 ** (level + 1)
+    assert (int(u), int(v)) == (2 * x + (quadrant & 1), 2 * y + (quadrant >> 1))
+    _, stretch = seen_from_anchor(anchor, positions_of(codes), ways)
+    expected = np.mean(1 / stretch) / oracle_density(lamp[None])[0]
+    assert np.isclose(energies[0, node, quadrant], expected, rtol=1e-3)
 
 
 def test_fading():

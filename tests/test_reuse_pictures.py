@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from parallax_tools import seen_from_anchor
 from PIL import Image
 from statistics_tools import device, every_device  # noqa: F401
 
@@ -281,29 +282,63 @@ def cells_of(words, bits):
     return leaves
 
 
+def node_map(cells, directions):
+    """Return which of the cells of a quadtree each direction [n, 3] is in."""
+    q = directions / np.abs(directions).sum(-1, keepdims=True)
+    x, z = q[:, 0], q[:, 2]
+    fold = (q[:, 1] < 0)[:, None]
+    sides = np.where(np.stack([x, z], -1) < 0, -1, 1)
+    uv = (np.where(fold, sides * (1 - np.abs(np.stack([z, x], -1))), np.stack([x, z], -1)) + 1) / 2
+    found = np.full(len(uv), -1)
+    for k, (x, y, edge) in enumerate(cells):
+        found[((uv >= (x, y)) & (uv < (x + edge, y + edge))).all(-1)] = k
+    return found
+
+
+def borders(nodes):
+    """Return which pixels have another node to the left or above."""
+    border = np.zeros(nodes.shape, bool)
+    border[:, 1:] |= nodes[:, 1:] != nodes[:, :-1]
+    border[1:] |= nodes[1:] != nodes[:-1]
+    return border
+
+
+def quadtree_map(scheduler, leaf, position):
+    """Return density [1/sr] and number of the cell, by pixel, of a leaf's quadtree as a point sees it, in float64."""
+    guides = scheduler.state("indirect").guides
+    cells = cells_of(guides.trees.numpy()[leaf], 128)
+    assert len(cells) == 97
+    directions = texel_directions(pictures.MAP_PIXELS).reshape(-1, 3)
+    seen, stretch = seen_from_anchor(guides.anchors.numpy()[leaf].astype(np.float64), position, directions)
+    nodes = node_map(cells, seen)
+    edges = np.array([edge for *_, edge in cells])
+    # a map of side 1 seen from its octahedron: dw = 4 du dv / |p|^3 for p = d / (|x| + |y| + |z|)
+    densities = stretch / (97 * edges[nodes] ** 2) / (4 * np.abs(seen).sum(-1) ** 3)
+    return densities.reshape(2 * [pictures.MAP_PIXELS]), nodes.reshape(2 * [pictures.MAP_PIXELS])
+
+
 def test_quadtree_beside_the_light(scheduler, frame, tmp_path):
     gi.reuse_pictures(scheduler, frame, tmp_path, PIXEL)
     image = read(tmp_path / "quadtree.png")
     size, gap = pictures.MAP_PIXELS, pictures.GAP
     leaf = leaves_of(scheduler, frame)[PIXEL[1], PIXEL[0]]
-    densities, _ = pictures.quadtree_densities(scheduler, leaf)
-    directions = texel_directions(size)
-    # a map of side 1 seen from its octahedron: dw = 4 du dv / |p|^3 for p = d / (|x| + |y| + |z|)
-    lengths = 1 / np.abs(directions).sum(-1)
-    expected, border = np.zeros((size, size)), np.zeros((size, size), bool)
-    cells = cells_of(scheduler.state("indirect").guides.trees.numpy()[leaf], 128)
-    assert len(cells) == 97 and min(cell[2] for cell in cells) >= 1 / 64 > 1 / size
-    for x, y, edge in cells:
-        rows, columns = (slice(round(a * size), round((a + edge) * size)) for a in (y, x))
-        expected[rows, columns] = 1 / (97 * edge**2)
-        border[rows, columns.start] |= columns.start > 0
-        border[rows.start, columns] |= rows.start > 0
-    expected *= lengths**3 / 4
-    np.testing.assert_allclose(densities, expected, rtol=1e-5)
-    assert np.mean(densities * 4 / lengths**3) == pytest.approx(1.0, rel=1e-6)
-    right = image[:size, 2 * (size + gap) : 3 * size + 2 * gap]
-    assert (right[border] == pictures.BORDER_COLOR).all()
     position, normal = frame.numpy("position")[PIXEL[1], PIXEL[0]], frame.numpy("normal")[PIXEL[1], PIXEL[0]]
+    expected, nodes = quadtree_map(scheduler, leaf, position.astype(np.float64))
+    anchor = scheduler.state("indirect").guides.anchors.numpy()[leaf]
+    assert 0.02 < np.linalg.norm(position - anchor[:3]) * anchor[3] < 0.8  # it sees other directions than its anchor
+    densities, found = pictures.quadtree_densities(scheduler, leaf, position)
+    same = np.isclose(densities, expected, rtol=1e-4)
+    assert same.mean() > 0.999  # rounding, beside borders
+    # the same cells, whatever their numbers
+    pairs, counts = np.unique(np.stack([found.ravel(), nodes.ravel()], -1), axis=0, return_counts=True)
+    assert len(np.unique(pairs[counts > 50][:, 0])) == (counts > 50).sum() > 80
+    # pixels are small beside cells, so their mean is an integral
+    lengths = 1 / np.abs(texel_directions(size)).sum(-1)
+    assert np.mean(densities * 4 / lengths**3) == pytest.approx(1.0, rel=2e-3)
+    border = borders(nodes)
+    right = image[:size, 2 * (size + gap) : 3 * size + 2 * gap]
+    marked = (right == pictures.BORDER_COLOR).all(-1)
+    assert (marked == border).mean() > 0.999
     light = pictures.incident_light(scheduler, frame, position + 1e-5 * normal, normal)
     coarse = texel_directions(pictures.MAP_TEXELS)
     assert (light[coarse @ normal < -0.1] == 0).all() and (light[coarse @ normal > 0.1] > 0).mean() > 0.9
@@ -315,7 +350,8 @@ def test_quadtree_beside_the_light(scheduler, frame, tmp_path):
     def heat(values):
         return magma((np.log10(np.maximum(values, 1e-3)) + 3) / (math.log10(top) + 3)).astype(int)
 
-    assert np.abs(right[~border] - heat(expected)[~border]).max() <= 1
+    plain = ~border & ~marked & same
+    assert np.abs(right[plain] - heat(expected)[plain]).max() <= 1
     step = size // pictures.MAP_TEXELS
     for k, values in enumerate((true, best)):
         panel = image[:size, k * (size + gap) : k * (size + gap) + size]

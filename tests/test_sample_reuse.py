@@ -199,6 +199,120 @@ def test_paths_may_be_longer_than_what_is_kept_of_them():
     assert np.isfinite(frames[0]["beauty"]).all()
 
 
+# ---- what paths leave behind ----
+
+
+def court(albedo, wall=0.6):
+    """A floor that the camera sees, between three high walls that do not touch it, under a sky of one."""
+    floor = gi.Material("floor", (albedo, albedo, albedo), specular=0.0)
+    grey = gi.Material("wall", (wall, wall, wall), specular=0.0)
+    parts = [
+        quad((-2, 0, 2), (4, 0, 0), (0, 0, -4), floor),
+        quad((-2, 0.1, -2), (4, 0, 0), (0, 5, 0), grey),
+        quad((-2, 0.1, 2), (0, 0, -4), (0, 5, 0), grey),
+        quad((2, 0.1, -2), (0, 0, 4), (0, 5, 0), grey),
+    ]
+    return gi.Scene([gi.Node("court", parts)], environment=1.0)
+
+
+class Kept:
+    """Samples of the first frame of the court by path and vertex, [path, 3]."""
+
+    def __init__(self, albedo, roulette_depth=9):
+        camera = gi.Camera.look_at((0, 1.5, 3.5), (0.0, 0.0, 0.0), hfov=40, resolution=SIZE)
+        indirect = gi.GuidedPaths(max_depth=4, roulette_depth=roulette_depth)
+        scheduler = gi.FrameScheduler(court(albedo), camera, pipeline(indirect=indirect), st.device().alias, seed=5)
+        scheduler.frame(0)
+        records, cube = scheduler._records, scheduler.state("octree").octree
+        assert records.vertices == 3 and records.stride == 1
+
+        def column(name):
+            return getattr(records, name).numpy().reshape(-1, 3)
+
+        codes = column("codes").astype(np.int64)
+        self.there = codes != 0xFFFFFFFF
+        places = [sum((codes >> (3 * bit + axis) & 1) << bit for bit in range(10)) for axis in range(3)]
+        self.positions = (np.stack(places, axis=-1) + 0.5) / cube.scale + np.array(cube.low)
+        self.on_floor = self.there & (self.positions[..., 1] < 0.05)
+        contributions = column("contributions")
+        self.known = self.there & (contributions >= 0)
+        self.contributions, self.carried, self.nearness = (
+            np.where(self.known, column(name), 0).astype(np.float64)
+            for name in ("contributions", "carried", "nearness")
+        )
+        mixtures = column("mixtures")
+        self.bsdf = (mixtures & 0xFFFF) / 65535 / np.maximum((mixtures >> 16) / 65535, 1e-9)
+        """Density of the BSDF over that of the mixture."""
+
+
+def test_contributions_do_not_count_what_came_before():
+    """Throughputs of grey Lambert walls are albedo times the density of the BSDF over that of the mixture."""
+    bright, dim = Kept(0.8), Kept(0.1)
+    assert np.array_equal(bright.known, dim.known)  # the same paths
+    for kept, albedo in ((bright, 0.8), (dim, 0.1)):
+        known, color = kept.known, np.where(kept.on_floor, albedo, 0.6)
+        assert (kept.carried[known[:, 0], 0] == 1).all()
+        throughput = np.cumprod(color * kept.bsdf, axis=1)[:, :-1]
+        sure = known[:, 1:] & (throughput > 0.02)  # mixtures have 16 bits
+        assert sure.sum() > 500 and np.allclose(kept.carried[:, 1:][sure], throughput[sure], rtol=0.01)
+        # of the sky, which a path is sure to see last, the surface reflects as much as if it were the first
+        last = known & ~np.pad(kept.there, ((0, 0), (0, 1)))[:, 1:] & (kept.nearness == 0)
+        assert np.array_equal(last.sum(axis=0) > 100, [True] * 3)
+        assert np.allclose(kept.contributions[last], (color * kept.bsdf)[last], rtol=0.01, atol=1e-4)
+    # beyond the floor nothing of it is left, unless the path comes back
+    after = bright.known[:, 1:] & bright.on_floor[:, :1] & ~bright.on_floor[:, 1:].any(axis=1)[:, None]
+    seen = after & (bright.contributions[:, 1:] > 0)
+    assert seen.sum() > 300
+    assert np.allclose(bright.contributions[:, 1:][after], dim.contributions[:, 1:][after], rtol=1e-4)
+    first = bright.on_floor[:, 0] & (bright.contributions[:, 0] > 0) & ~bright.on_floor[:, 1:].any(axis=1)
+    assert first.sum() > 300
+    assert np.allclose(bright.contributions[first, 0], 8 * dim.contributions[first, 0], rtol=1e-4)
+
+
+def test_roulette_does_not_change_what_is_expected_of_later_vertices():
+    """Paths that survive carry more, and what they bring is over that."""
+    plain, kept = Kept(0.3), Kept(0.3, roulette_depth=2)
+    assert kept.there[:, 1].sum() < 0.8 * plain.there[:, 1].sum()
+    both = plain.known[:, 1] & kept.known[:, 1] & ~kept.there[:, 2] & ~plain.there[:, 2]
+    assert both.sum() > 100 and (kept.carried[both, 1] > 1.05 * plain.carried[both, 1]).mean() > 0.9
+    assert np.allclose(kept.contributions[both, 1], plain.contributions[both, 1], rtol=1e-4)
+
+
+def test_nearness_is_of_what_is_hit():
+    """One over the distance to the next vertex, within the cells that positions are known by; 0 of the sky."""
+    kept = Kept(0.5)
+    distances = np.linalg.norm(np.diff(kept.positions, axis=1), axis=-1)
+    follows = kept.known[:, :-1] & kept.there[:, 1:]
+    assert follows.sum() > 1000
+    cell = 5.1 / 1024 * np.sqrt(3)
+    assert np.abs(1 / kept.nearness[:, :-1][follows] - distances[follows]).max() < cell
+    ends = kept.known[:, :-1] & ~kept.there[:, 1:]
+    assert ends.sum() > 1000 and not kept.nearness[:, :-1][ends].any()
+
+
+def test_spheres_stand_where_light_comes_from():
+    """After a frame the sphere of a region is as large as the light's distances say, or as the cell demands."""
+    scheduler, _ = sequence([0], court(0.5), pipeline(indirect=gi.GuidedPaths(max_depth=5, samples=1 << 20)))
+    records, state = scheduler._records, scheduler.state("octree")
+    contributions, nearness = (
+        getattr(records, name).numpy().astype(np.float64) for name in ("contributions", "nearness")
+    )
+    lit = (records.codes.numpy() != 0xFFFFFFFF) & (contributions > 0)
+    guides = scheduler.state("indirect").guides
+    sums, anchors = guides.nearness.numpy().astype(np.float64), guides.anchors.numpy()
+    light = contributions[lit]
+    assert np.allclose(sums.sum(axis=0), [light.sum(), light @ nearness[lit]], rtol=1e-4)
+    cells = 1024 / state.octree.scale / 2.0 ** (state.levels.numpy().repeat(8) + 1)
+    used = sums[:, 0] > 0
+    found, most = sums[used, 1] / sums[used, 0], 0.8 / (cells[used] * np.sqrt(3) / 2)
+    assert np.allclose(anchors[used, 3], np.minimum(found, most), rtol=1e-5)
+    assert (found < most).sum() > 20 and used.sum() > 50
+    assert not anchors[~used, 3].any()
+    # anchors are in the middle of cells
+    places = (anchors[used, :3] - np.array(state.octree.low)) / cells[used, None]
+    assert np.abs(places % 1 - 0.5).max() < 1e-3
+
+
 def test_states_fit_only_their_own(tmp_path):
     scheduler, _ = sequence([0, 1])
     path = scheduler.save_state(tmp_path / "a.safetensors", "frames")

@@ -196,7 +196,7 @@ def _draw_quadtree(
     _check_surface(leaf, pixel)
     origin, normal = view.origins.numpy()[item], view.normals.numpy()[item].astype(np.float64)
     light = incident_light(scheduler, frame, origin, normal)
-    densities, cells = quadtree_densities(scheduler, leaf)
+    densities, cells = quadtree_densities(scheduler, leaf, origin)
     directions = low_directions(MAP_TEXELS).astype(np.float64)
     angles = directions[:, 3].reshape(light.shape)
     reflected = light * np.maximum(directions[:, :3] @ normal, 0.0).reshape(light.shape)
@@ -253,11 +253,13 @@ def incident_light(scheduler: FrameScheduler, frame: Frame, origin: np.ndarray, 
     return incident.light.numpy().reshape(MAP_TEXELS, MAP_TEXELS).astype(np.float64)
 
 
-def quadtree_densities(scheduler: FrameScheduler, leaf: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the density [1/sr] of a leaf's quadtree and its cells' nodes, [MAP_PIXELS, MAP_PIXELS] each."""
-    tree = scheduler.state("indirect").guides.trees.numpy()[leaf]
+def quadtree_densities(scheduler: FrameScheduler, leaf: int, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the density [1/sr] of a leaf's quadtree at a position and its cells' nodes, [MAP_PIXELS, MAP_PIXELS]."""
+    guides = scheduler.state("indirect").guides
+    tree, anchor = guides.trees.numpy()[leaf], guides.anchors.numpy()[leaf]
     densities = wp.empty(MAP_PIXELS**2, dtype=wp.float32, device=scheduler.device)
     nodes = wp.empty(MAP_PIXELS**2, dtype=wp.int32, device=scheduler.device)
-    inputs = [wp.vec4ui(*tree.tolist()), scheduler.pipeline.indirect.bits, MAP_PIXELS, densities, nodes]
-    launch.launch(kernels.map_quadtree, MAP_PIXELS**2, inputs, scheduler.device)
+    settings = [wp.vec4ui(*tree.tolist()), scheduler.pipeline.indirect.bits]
+    settings += [wp.vec4(*anchor.tolist()), wp.vec3(*position.tolist()), MAP_PIXELS]
+    launch.launch(kernels.map_quadtree, MAP_PIXELS**2, [*settings, densities, nodes], scheduler.device)
     return tuple(values.numpy().reshape(MAP_PIXELS, MAP_PIXELS) for values in (densities, nodes))

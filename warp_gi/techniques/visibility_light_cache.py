@@ -28,7 +28,8 @@ class VisibilityLightCache(Estimator):
     """Direct light from emitters, of which each region samples those that it or a neighbour of it saw lately.
 
     Lights are selected by what they reflect at the very point: the closed-form cosine integral of their triangle, and
-    linearly transformed cosines for GGX. A share of samples explores. Unbiased. Every path vertex uses it.
+    linearly transformed cosines for GGX; and by how often they are seen. With a share of samples another light is
+    explored. Unbiased. Every path vertex uses it.
     """
 
     term: ClassVar[str] = "emitters"
@@ -36,10 +37,10 @@ class VisibilityLightCache(Estimator):
     capacity: int = 32
     """Lights a bucket at most, 1 to 32; more lights go to more buckets, of which a sample weighs one."""
     exploration: float = 0.1
-    """Share of samples that explore, in (0, 1): the first one, and the only one unless ``adapts_exploration``; at
+    """Share of samples that also explore, in (0, 1): the first one, and the only one unless ``adapts_exploration``; at
     least 0.3 then in frames in which a light moves."""
     adapts_exploration: bool = True
-    """Whether each region learns the share that its samples would have varied least with, from 0.05 to 0.9."""
+    """Whether each region learns the share, from 0.05 to 0.75: by what exploring brings of what varies."""
     memory: int = 8
     """Frames that a light stays in a region after it was last seen, 0 to 200."""
     explores_by: str = "hierarchy"
