@@ -25,7 +25,7 @@ class LightChoice:
     item: wp.int32  # -1: none
     pdf: wp.float32  # expected number of times that it is selected: a probability, where one choice is made
     weight: wp.float32  # factor of what it brings; 1, where one choice is made
-    explores: wp.int32  # 1: found by exploring, beside what a cache offers
+    explores: wp.int32  # found by exploring: 1; 2, where the cache selects the light more often than that
 
 
 # radiance is over pdf already for lights without size (delta = 1), whose pdf is the

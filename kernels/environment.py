@@ -101,18 +101,21 @@ def patch_texel(p: Patch) -> wp.vec3:
     return upper * (1.0 - p.t) + lower * p.t
 
 
-# Sine of the polar angle of nodes at `row`, measured from the nearer pole.
+# Cosine and sine of the polar angle `t` of a row below its nodes; measured from the nearer pole, for their precision.
 @wp.func
-def row_sine(row: wp.float32, height: wp.int32) -> wp.float32:
-    last = wp.float32(height - 1)
-    return circle(0.5 * wp.min(row, last - row) / last)[1]
+def polar_angle(row: wp.int32, t: wp.float32, height: wp.int32) -> wp.vec2:
+    last = height - 1
+    if 2 * row < last:
+        return circle(0.5 * (wp.float32(row) + t) / wp.float32(last))
+    below = circle(0.5 * (wp.float32(last - row) - t) / wp.float32(last))
+    return wp.vec2(-below[0], below[1])
 
 
 # Density [1/sr] of a direction that is `sine` away from the poles' axis, in a patch's row. `pdf_scale` is one over the
 # integral of luminance over latitude and longitude, times the sines in the middle of rows.
 @wp.func
 def patch_pdf(env: Environment, row: wp.int32, texel: wp.vec3, sine: wp.float32) -> wp.float32:
-    middle = row_sine(wp.float32(row) + 0.5, env.height)
+    middle = polar_angle(row, 0.5, env.height)[1]
     return luminance(texel) * env.pdf_scale * middle / wp.max(sine, 1.0e-12)
 
 
@@ -146,8 +149,11 @@ def environment_lookup(env: Environment, direction: wp.vec3) -> EnvironmentLooku
 # Where a density that goes from a to b, in a straight line over [0, 1], has the share u below.
 @wp.func
 def sample_linear(a: wp.float32, b: wp.float32, u: wp.float32) -> wp.float32:
-    root = wp.sqrt(wp.lerp(a * a, b * b, u))
-    return wp.min(u * (a + b) / wp.max(a + root, 1.0e-30), 1.0)
+    scale = 1.0 / wp.max(wp.max(a, b), 1.0e-38)  # squares of radiances could be beyond what a float32 holds
+    low = a * scale
+    high = b * scale
+    root = wp.sqrt(wp.lerp(low * low, high * high, u))
+    return wp.min(u * (low + high) / wp.max(low + root, 1.0e-30), 1.0)
 
 
 # A direction by the luminance from there, from three uniform numbers in [0, 1): u[0] with further digits u[2] picks a
@@ -167,14 +173,12 @@ def environment_sample(env: Environment, u: wp.vec3) -> EnvironmentSample:
             wp.lerp(left[0], left[1], patch.t), wp.lerp(right[0], right[1], patch.t), choice.remainder
         )
         texel = patch_texel(patch)
-        place = wp.float32(row) + patch.t
-        sine = row_sine(place, env.height)
-        cosine = circle(0.5 * place / wp.float32(env.height - 1))[0]
-        around = circle((wp.float32(column) + 0.5 + patch.s) / wp.float32(env.width)) * sine
-        local = wp.vec3(around[1], cosine, -around[0])
+        polar = polar_angle(row, patch.t, env.height)
+        around = circle((wp.float32(column) + 0.5 + patch.s) / wp.float32(env.width)) * polar[1]
+        local = wp.vec3(around[1], polar[0], -around[0])
         result.direction = wp.transpose(env.environment_from_world) * local
         result.radiance = wp.cw_mul(texel, env.radiance)
-        result.pdf = patch_pdf(env, row, texel, sine)
+        result.pdf = patch_pdf(env, row, texel, polar[1])
     elif env.kind == ENVIRONMENT_CONSTANT:
         z = 1.0 - 2.0 * u[1]
         r = wp.sqrt(wp.max(0.0, 1.0 - z * z))

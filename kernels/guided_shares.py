@@ -3,6 +3,8 @@
 A sample of light c drawn with density p is c^2 p / p_a of the second moment that the mixture with share a would have,
 p_a = a p_bsdf + (1 - a) p_guide: its expectation is the integral of f^2 / p_a. A few shares are tried on the same
 samples, and the one with the least sum is taken. Sums of earlier frames fade.
+
+The same pass over the samples finds how far away the light comes from, which each region's anchor needs (parallax.py).
 """
 
 import warp as wp
@@ -17,7 +19,7 @@ wp.set_module_options({"enable_backward": False})
 SHARES = 6
 ShareMoments = wp.types.vector(length=SHARES, dtype=wp.float32)
 FADING = wp.constant(wp.float32(0.8))  # of what is known, each frame
-NEAREST_ANCHOR = wp.constant(wp.float32(0.8))  # largest radius of a cell over that of its anchor's sphere
+NEAREST_ANCHOR = wp.constant(wp.float32(0.5))  # largest radius of a cell over that of its anchor's sphere
 CORRECTION = wp.constant(wp.float32(0.2))  # of an anchor's nearness, below which it is left
 
 
@@ -118,11 +120,13 @@ def adapt_shares(
     glossy = guides.moments[2 * leaf + 1] * FADING
     looks = wp.min(count, samples.most)
     nearness = guides.nearness[leaf] * FADING
+    cell = leaf_cell(octree, tree, leaf)
+    nearest = NEAREST_ANCHOR / cell[3]  # of each sample too: a corner is a millimetre away, and would outweigh the rest
     for k in range(looks):
         slot = samples.order[samples.starts[leaf] + spread_place(k, looks, count)]
         contribution = records.contributions[slot]
         if contribution > 0.0 and contribution < LARGEST_CONTRIBUTION:
-            nearness = nearness + contribution * wp.vec2(1.0, records.nearness[slot])
+            nearness = nearness + contribution * wp.vec2(1.0, wp.min(records.nearness[slot], nearest))
             densities = mixture_densities(records.mixtures[slot])
             square = contribution * contribution
             is_glossy = (records.lights[slot] & SURFACE_GLOSSY) != wp.uint32(0)
@@ -140,8 +144,7 @@ def adapt_shares(
     guides.nearness[leaf] = nearness
     if nearness[0] > 0.0:
         anchor = guides.anchors[leaf]
-        cell = leaf_cell(octree, tree, leaf)
-        found = wp.min(nearness[1] / nearness[0], NEAREST_ANCHOR / cell[3])
+        found = wp.min(nearness[1] / nearness[0], nearest)
         # small corrections would only unsettle the tree
         if wp.abs(found - anchor[3]) > CORRECTION * wp.max(found, anchor[3]):
             anchor[3] = found

@@ -65,7 +65,7 @@ class CacheRegion:
 class Bucket:
     begin: wp.int32  # in CacheTables.items
     count: wp.int32
-    chance: wp.float32  # of being picked, where a sample does not explore
+    chance: wp.float32  # of being picked
 
 
 @wp.func
@@ -271,7 +271,7 @@ def another_light(
             pdf = offered_pdf(cache, here, s, wo, r.item)
             r.pdf = pdf + explored
             r.weight = choice_weight(explored, pdf)
-            r.explores = 1
+            r.explores = wp.where(explored > pdf, 1, 2)
     return r
 
 

@@ -168,7 +168,8 @@ def join_lights(
     joined.counts[leaf] = count
 
 
-EXPLORATION_PRICE = wp.constant(wp.float32(0.25))
+SMALLEST_MOMENT = wp.constant(wp.float32(1.0e-30))
+EXPLORATION_PRICE = wp.constant(wp.float32(0.1))
 MOST_TRIES = wp.constant(wp.float32(32.0))  # that are remembered of a light
 
 
@@ -204,9 +205,9 @@ FADING = wp.constant(wp.float32(0.8))  # of moments, each frame
 # share times the latter, about what exploring costs.
 @wp.func
 def exploration_share(moments: wp.vec2, settings: CacheSettings) -> wp.float32:
-    share = settings.most_exploration
-    if moments[0] > 0.0:
-        share = wp.sqrt(moments[1] / (moments[0] * EXPLORATION_PRICE))
+    share = settings.least_exploration
+    if moments[1] > 0.0:
+        share = wp.sqrt(moments[1] / wp.max(moments[0] * EXPLORATION_PRICE, SMALLEST_MOMENT))
     return wp.clamp(share, settings.least_exploration, settings.most_exploration)
 
 

@@ -119,10 +119,10 @@ def keep_vertex(data: SampleRegions, slot: wp.int32, s: Surface):
     data.records.contributions[slot] = NO_DIRECTION
 
 
-# Of two light samples the explored one, if it arrives.
+# Of two light samples the explored one, if it arrives and tells of a light that the cache does not offer.
 @wp.func
 def keep_light(data: SampleRegions, slot: wp.int32, choice: LightChoice, visible: wp.int32, light: wp.float32):
-    if choice.item < 0 or (choice.explores != 0 and visible <= 0):
+    if choice.item < 0 or choice.explores > 1 or (choice.explores != 0 and visible <= 0):
         return
     word = (data.records.lights[slot] & SURFACE_GLOSSY) | wp.uint32(choice.item + 1)
     if choice.explores != 0:

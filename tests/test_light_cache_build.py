@@ -52,7 +52,7 @@ MOST_BUCKETS = 64  # beside the first
 LEAST_CHANCE = 0.02
 MOST_TRIES = 32
 FADING = 0.8
-PRICE = 0.25  # of exploring
+PRICE = 0.1  # of exploring
 LARGEST = 1e15  # samples beyond say nothing
 MAIN = -1.0
 
@@ -485,7 +485,7 @@ def expected_weights(settings, grouped, records, entries, tries, origins, known)
             if counts[leaf] > 0 and known.buckets.numpy()[origin] > 0:
                 moment = FADING * moment + (brought["offered"], brought["explored"] * share)
                 # as much as makes the noise of exploring a quarter of the rest's times the share
-                share = np.sqrt(moment[1] / (PRICE * moment[0])) if moment[0] > 0 else np.inf
+                share = np.sqrt(moment[1] / max(PRICE * moment[0], 1e-30)) if moment[1] > 0 else 0.0
         moments.append(moment)
         shares.append(np.clip(share, settings.least_exploration, settings.most_exploration))
         capped = [(n * min(1.0, MOST_TRIES / max(all_, 1)), min(all_, MOST_TRIES)) for n, all_ in counted.values()]
@@ -604,7 +604,7 @@ def test_samples_that_say_nothing_of_exploration(light, value, buckets, expected
     grouped, records = leaf_samples([5, 5, 5], range(15), 9), records_of([light] * 15, [value] * 15)
     _, moments, shares = weighed(settings, grouped, records, *given)
     assert np.allclose(moments, expected)
-    by_moments = [0.75, np.sqrt(0.1 / 9 / PRICE), 0.15]  # as much as may be, where nothing is known
+    by_moments = [0.05, np.sqrt(0.1 / 9 / PRICE), 0.15]  # as little as may be, where nothing was found
     assert np.allclose(shares, by_moments if buckets else [0.33, 0.4, 0.15])
 
 
@@ -647,7 +647,7 @@ def test_exploration_falls_where_the_cache_holds_all_that_matters():
     hidden = np.setdiff1d(np.arange(203), known)
     shares, light = learnt_exploration((known, [], 0), hidden)
     assert len(shares) > 6 and (light > 0).sum(axis=1).max() > 12
-    assert np.allclose(shares, 0.05), shares
+    assert np.allclose(shares, 0.05, atol=0.005), shares
 
 
 def test_exploration_rises_where_the_cache_cannot_hold_what_matters():

@@ -34,7 +34,10 @@ def with_arrays(state: Any, arrays: Mapping[str, np.ndarray], device: wp.Device,
     Raises KeyError where ``arrays`` lacks one, ValueError where its items do not fit.
     """
     if isinstance(state, wp.array):
-        return wp.array(arrays[name], dtype=state.dtype, device=device)
+        restored = wp.array(arrays[name], dtype=state.dtype, device=device)
+        if restored.ndim != state.ndim:
+            raise ValueError(f"{name} has {arrays[name].ndim} dimensions")
+        return restored
     if isinstance(state, np.ndarray):
         return arrays[name]
     parts = {key: with_arrays(value, arrays, device, f"{name}.{key}" if name else key) for key, value in _parts(state)}
