@@ -36,6 +36,9 @@ TARGETS = (
     (MINE.name, "indirect", "LightHierarchy + GuidedPaths", 1 / 10),
     (MINE_ONE_BOUNCE.name, "indirect", "LightHierarchy + GuidedPaths", 1 / 100),
 )
+TARGET_PLACES = (WAREHOUSE, MINE, MINE_ONE_BOUNCE)
+LARGE, SMALL = (480, 270), (240, 135)
+"""Pixels of the places that have targets, and of others: regions are finer where there are more samples."""
 OURS = (
     "LightHierarchy + GuidedPaths",
     "VisibilityLightCache + BsdfPaths",
@@ -63,12 +66,13 @@ def pipelines(**settings: Any) -> dict[str, gi.Pipeline]:
 
 def quality_rows(quick: bool, device: str) -> list[Row]:
     """Return rows of all combinations, of the targets, and what the paper says."""
-    size, spp, frames, settled = ((120, 68), 48, 14, 8) if quick else ((480, 270), 128, 30, 18)
+    spp, frames, settled = (48, 14, 8) if quick else (96, 26, 16)
     rows: list[Row] = []
     for place in QUICK_PLACES if quick else PLACES:
         if place.missing:
             rows.append({"table": "combinations", "case": place.name, "skipped": place.missing})
             continue
+        size = (120, 68) if quick else LARGE if place in TARGET_PLACES else SMALL
         rows += place_rows(place, size, spp, frames, settled, device)
     rows += target_rows(rows)
     return [*rows, *({"table": "combinations: paper", "case": case, "says": text} for case, text in PAPER)]

@@ -43,7 +43,7 @@ def _pipeline(emitters: gi.Estimator, indirect: gi.Estimator) -> gi.Pipeline:
 
 def adaptation_rows(quick: bool, device: str) -> list[Row]:
     """Return how errors fall from an empty octree, cache and quadtrees in the warehouse."""
-    size, spp, seeds = ((120, 68), 48, 2) if quick else ((240, 135), 192, 8)
+    size, spp, seeds = ((120, 68), 48, 2) if quick else ((240, 135), 192, 6)
     rows = place_adaptation(WAREHOUSE, size, spp, seeds, LAST, device)
     return [*rows, {"table": "adaptation: paper, figure 9", "case": "Quake 2 room", **PAPER_ADAPTATION}]
 
@@ -78,7 +78,7 @@ def place_adaptation(place: Place, size: tuple[int, int], spp: int, seeds: int, 
 
 def turning_rows(quick: bool, device: str) -> list[Row]:
     """Return how quadtrees follow a light that turns, by bits, migrations and degrees."""
-    size, spp, seeds, before, after = ((48, 48), 256, 2, 16, 24) if quick else ((96, 96), 1024, 8, 32, 40)
+    size, spp, seeds, before, after = ((48, 48), 256, 2, 16, 24) if quick else ((96, 96), 1024, 6, 32, 40)
     bits = (32, 128) if quick else BITS
     rows: list[Row] = []
     for turn in PAPER_TURNING:
