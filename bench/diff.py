@@ -42,8 +42,8 @@ ERROR, ACCURACY, MEMORY = Measure(False, 0.05, False), Measure(True, 0.05, False
 RULES: tuple[tuple[str, Measure | None], ...] = (
     (r"\bpaper|\b(in|for) this\b", None),
     (r"faster|speed-?up|^times |(^| )x$|^ratio (wall|cpu)|^(ours|in order) / |/ ours$", RATE),
-    (r"^(mitsuba|embree|warp|tree|raw|traced|without)\b", None),  # peers and baselines: not ours to be slower
-    (r"/ ?((wall|cpu) )?s$", RATE),
+    (r"^(mitsuba|embree|blender|warp|tree|raw|traced|without)\b", None),  # peers and baselines: not ours to be slower
+    (r"/ ?((wall|cpu) )?s$|\ba minute$", RATE),
     (r"\bagree|\bPSNR\b", ACCURACY),
     (r"\bequal time$|\b(time|cost|paths) / baseline$", TIME),
     (r"\bequal samples$|/ baseline$|MSE\b|\bFLIP\b|\berrors?\b|\bwrong\b|\bbias\b", ERROR),

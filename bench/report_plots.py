@@ -34,6 +34,19 @@ class Choice:
 _BY_FRAME = ("MSE / settled by frame",)
 
 PLOTS = (
+    Choice("compare", "error over time", "Error over render time", "render s", ("RMSE",), ("pipeline",), True, True),
+    Choice("compare", "error over time", "Error over frames", "frames", ("RMSE",), ("pipeline",), True, True),
+    Choice(
+        "compile",
+        "modules",
+        "Seconds to load a kernel module over its size",
+        "object kB",
+        ("cold s", "warm s"),
+        (),
+        True,
+        True,
+    ),
+    Choice("sequence", "memory over frames", "Memory over frames", "frame number", ("MB",), ("pipeline",)),
     Choice("rays", "", "Rays a second over triangles", "triangles", ("ours Mrays/s",), ("rays", "query"), True, True),
     Choice(
         "rays", "", "Building over triangles", "triangles", ("ours build s", "embree build s"), (), True, True, True

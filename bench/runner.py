@@ -12,7 +12,8 @@ import json
 import os
 import platform
 import subprocess
-from collections.abc import Sequence
+import traceback
+from collections.abc import Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,22 @@ def run_suite(name: str, quick: bool, device: str) -> list[dict[str, Any]]:
     return importlib.import_module(f"warp_gi.bench.{name}").run(quick=quick, device=device)
 
 
+def run_all(quick: bool, device: str) -> Iterator[tuple[str, list[dict[str, Any]], bool]]:
+    """Yield (suite, rows, whether it failed) of every suite in turn; one that fails has a row that says why.
+
+    Raises OptionError if there is no such device.
+    """
+    launch.get_device(device)
+    for name in suites():
+        try:
+            rows, failed = run_suite(name, quick, device), False
+        except Exception as error:  # whatever a suite does, the others go on
+            if os.environ.get("WARP_GI_DEBUG", "0") != "0":
+                traceback.print_exc()
+            rows, failed = [{"failed": f"{type(error).__name__}: {' '.join(str(error).split())}"}], True
+        yield name, rows, failed
+
+
 def print_rows(title: str, rows: Sequence[dict[str, Any]]) -> None:
     """Print rows as tables, one for each set of keys."""
     tables: dict[tuple[str, ...], list[dict[str, Any]]] = {}
@@ -57,7 +74,7 @@ def print_rows(title: str, rows: Sequence[dict[str, Any]]) -> None:
 
 def json_lines(suite: str, rows: Sequence[dict[str, Any]], quick: bool, device: str) -> str:
     """Return each row as a line of JSON, with what is needed to repeat it; ``records.read`` reads them."""
-    return "".join(json.dumps(row, default=float) + "\n" for row in stamped(suite, rows, quick, device))
+    return _lines(stamped(suite, rows, quick, device))
 
 
 def stamped(suite: str, rows: Sequence[dict[str, Any]], quick: bool, device: str) -> list[dict[str, Any]]:
@@ -68,8 +85,17 @@ def stamped(suite: str, rows: Sequence[dict[str, Any]], quick: bool, device: str
 
 def write_json_lines(path: Path, suite: str, rows: Sequence[dict[str, Any]], quick: bool, device: str) -> None:
     """Write ``json_lines`` to a file; raises OSError."""
+    write_lines(path, stamped(suite, rows, quick, device))
+
+
+def write_lines(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write stamped rows to a file, one a line; raises OSError."""
     with replacing(path) as part:
-        part.write_text(json_lines(suite, rows, quick, device), encoding="utf-8")
+        part.write_text(_lines(rows), encoding="utf-8")
+
+
+def _lines(rows: Sequence[dict[str, Any]]) -> str:
+    return "".join(json.dumps(row, default=float) + "\n" for row in rows)
 
 
 def environment(device: str) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -100,6 +100,12 @@ def race(stages: Mapping[str, Stage | Callable[[], Any]], repetitions: int) -> d
 def cost(times: Times, device: str) -> float:
     """Return what counts of ``times``: CPU seconds on a CPU, of which others use some; wall seconds on a GPU."""
     return times[1] if launch.get_device(device).is_cpu else times[0]
+
+
+def median_and_spread(name: str, values: Sequence[float]) -> Row:
+    """Return the median, and half of the range that the middle half of the values lie in."""
+    low, middle, high = np.percentile(values, (25, 50, 75))
+    return {name: float(middle), f"{name} spread": float(high - low) / 2}
 
 
 def rmse(a: np.ndarray, b: np.ndarray | float = 0.0) -> float:

@@ -24,8 +24,9 @@ def names(changes):
 LOWER = """wall s | paths ms | seconds | ns a pixel | wall s to 0.01 | MSE beauty | ours relMSE | RMSE | ST FLIP
     | error ratio | bytes a triangle | KB | peak GB | beauty / baseline | beauty, equal time | wrong per million"""
 HIGHER = """Mrays/s | Mrays/wall s | faster, cpu | speed-up | x | faster at equal error, cpu | agree | ratio cpu
-    | embree / ours | ours / embree | times mitsuba, wall"""
-NEITHER = """mitsuba wall s | embree Mrays/s | paper's method, ratio cpu | leaves | paths spp for this RMSE | samples"""
+    | ours frames a minute | embree / ours | ours / embree | times mitsuba, wall"""
+NEITHER = """blender frames a minute | mitsuba wall s | embree Mrays/s | paper's method, ratio cpu | leaves
+    | paths spp for this RMSE | samples"""
 
 
 @pytest.mark.parametrize("columns, higher", [(LOWER, False), (HIGHER, True), (NEITHER, None)])

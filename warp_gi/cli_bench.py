@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -16,16 +18,22 @@ from warp_gi.cli_report import print_table, start_warp
 from warp_gi.errors import OptionError
 from warp_gi.files import check_writable
 
+if TYPE_CHECKING:
+    from warp_gi.bench.report import PictureSet
+
+ALL = "all"
+
 
 @dataclass
 class Bench:
     """Run a benchmark suite and print its tables. Without SUITE, list the suites.
 
+    warp-gi bench compare, which has options of its own, compares pipelines on a scene that you name.
     --report makes a report of results files, and --diff compares two of them; neither runs anything.
     """
 
     suite: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SUITE", help_behavior_hint="")] = ""
-    """Name of a module in bench/."""
+    """Name of a module in bench/, or all."""
     quick: bool = False
     """Smaller inputs, for a first look; not for figures that anyone quotes."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
@@ -46,16 +54,21 @@ class Bench:
 
 def main(arguments: Sequence[str]) -> int:
     """Run the command."""
+    if arguments[:1] == ["compare"]:
+        return importlib.import_module("warp_gi.cli_bench_compare").main(arguments[1:])
     options = parse_options(Bench, "bench", arguments)
     _check(options)
     if options.diff is not None:
         return diff.diff_files(*options.diff, options.tolerance)
     if options.report:
-        _write_html(options.html, records.read(options.report))
+        write_html(options.html, records.read(options.report))
+    elif options.suite == ALL:
+        return _run_all(options)
     elif options.suite:
         _run(options)
     else:
-        print_table("suites", ("name", "what it measures"), sorted(runner.suites().items()))
+        others = [(ALL, "Every suite in turn."), ("compare", "Pipelines on a scene of your own; see its --help.")]
+        print_table("suites", ("name", "what it measures"), [*sorted(runner.suites().items()), *others])
     return 0
 
 
@@ -70,16 +83,13 @@ def _check(options: Bench) -> None:
         raise OptionError("--report needs --html FILE, to write the report to")
     if (options.html or options.json) and not (options.suite or options.report):
         raise OptionError("nothing to write: give a SUITE to run, or --report RESULTS... with --html FILE")
-    if options.html is not None and options.html.is_dir():
-        raise OptionError(f"--html {options.html}: is a folder; give a file")
+    for name, path in (("--html", options.html), ("--json", options.json)):
+        if path is not None and path.is_dir():
+            raise OptionError(f"{name} {path}: is a folder; give a file")
 
 
 def _run(options: Bench) -> None:
-    start_warp(options.device)
-    if options.threads is not None:
-        launch.set_threads(options.threads)
-    if options.html is not None and options.suite in runner.suites():
-        check_writable(options.html.absolute().parent)
+    _start(options)
     rows = runner.run_suite(options.suite, options.quick, options.device)
     runner.print_rows(options.suite, rows)
     if options.json == Path("-"):
@@ -88,10 +98,41 @@ def _run(options: Bench) -> None:
         runner.write_json_lines(options.json, options.suite, rows, options.quick, options.device)
         print(f"rows: {options.json}")
     if options.html is not None:
-        _write_html(options.html, runner.stamped(options.suite, rows, options.quick, options.device))
+        write_html(options.html, runner.stamped(options.suite, rows, options.quick, options.device))
 
 
-def _write_html(path: Path, rows: list[records.Row]) -> None:
+def _run_all(options: Bench) -> int:
+    """Run every suite; results are written after each, so that they outlive what comes later. 1 if any failed."""
+    _start(options)
+    rows, failed = [], []
+    for suite, found, is_failed in runner.run_all(options.quick, options.device):
+        rows += runner.stamped(suite, found, options.quick, options.device)
+        failed += [suite] * is_failed
+        runner.print_rows(suite, found)
+        if options.json == Path("-"):
+            print(runner.json_lines(suite, found, options.quick, options.device), end="")
+        elif options.json is not None:
+            runner.write_lines(options.json, rows)
+    if options.json not in (None, Path("-")):
+        print(f"rows: {options.json}")
+    if options.html is not None:
+        write_html(options.html, rows)
+    if failed:
+        print(f"failed: {', '.join(failed)}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _start(options: Bench) -> None:
+    start_warp(options.device)
+    if options.threads is not None:
+        launch.set_threads(options.threads)
+    for path in (options.html, options.json):
+        if path not in (None, Path("-")) and options.suite in (*runner.suites(), ALL):
+            check_writable(path.absolute().parent)
+
+
+def write_html(path: Path, rows: list[records.Row], pictures: Sequence[PictureSet] = (), quiet: bool = False) -> None:
+    """Write a report of stamped rows, with the plots that they allow; raises OSError."""
     from warp_gi.bench import report, report_plots
 
     by_suite: dict[str, list[records.Row]] = {}
@@ -99,5 +140,6 @@ def _write_html(path: Path, rows: list[records.Row]) -> None:
         by_suite.setdefault(str(row.get("suite", "")), []).append(row)
     plots = [plot for suite, group in by_suite.items() for plot in report_plots.plots_of(suite, group)]
     suites = ", ".join(filter(None, by_suite))
-    report.write_report(path, f"warp_gi: {suites}" if suites else "warp_gi", rows, plots=plots)
-    print(f"report: {path}")
+    report.write_report(path, f"warp_gi: {suites}" if suites else "warp_gi", rows, pictures, plots)
+    if not quiet:
+        print(f"report: {path}")
