@@ -182,6 +182,7 @@ def test_a_computed_reference_has_two_independent_halves():
     found = computed(scene, camera, "cpu", 1, 256, told=told.append)
     a, b = found.halves
     assert found.about["spp"] == 256 and told[-1] == 1.0 and 0 < found.noise < 0.2 * a.mean()
+    assert "noise is taken out" in found.about["says"]  # to which the row of a noisy one adds
     assert abs(np.corrcoef((a - found.picture).ravel(), (b - found.picture).ravel())[0, 1] + 1) < 1e-9
     assert a.mean() == pytest.approx(b.mean(), rel=0.05)
 
