@@ -98,6 +98,8 @@ class Run:
         denoise = self.pipeline.denoise
         if self.count < 2 or (denoise is not None and denoise.remembers):
             return None
+        if reference.noise is not None and reference.noise > self.points[-1].rmse:
+            return None  # relative errors are over a picture that is wrong itself, and would pass for a floor
         return reference.floor(self.sums[0] / ((self.count + 1) // 2), self.sums[1] / (self.count // 2))
 
 

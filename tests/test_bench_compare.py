@@ -309,3 +309,8 @@ def test_a_reference_noisier_than_the_pictures_says_so(truth):
         runs["a"].points[-1] = Point(1, 1.0, 0.1)
         row = compare_rows.rows_of(found, 1.0, {})[0]
         assert row["table"] == "reference" and ("more --reference-spp" in row["says"]) == is_noisy
+        # nor does anything count as a floor then
+        run = Metronome("b", 1.0, []).run(reference)
+        for _ in range(2):
+            run.add(noisy(truth, 0.0, 3) + 0.2, 1.0, 1.0, reference, 9.0)
+        assert (run.floor(reference) is None) == is_noisy
