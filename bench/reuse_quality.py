@@ -36,7 +36,6 @@ TARGETS = (
     (MINE.name, "indirect", "LightHierarchy + GuidedPaths", 1 / 10),
     (MINE_ONE_BOUNCE.name, "indirect", "LightHierarchy + GuidedPaths", 1 / 100),
 )
-TARGET_PLACES = (WAREHOUSE, MINE, MINE_ONE_BOUNCE)
 LARGE, SMALL = (480, 270), (240, 135)
 """Pixels of the places that have targets, and of others: regions are finer where there are more samples."""
 OURS = (
@@ -72,7 +71,7 @@ def quality_rows(quick: bool, device: str) -> list[Row]:
         if place.missing:
             rows.append({"table": "combinations", "case": place.name, "skipped": place.missing})
             continue
-        size = (120, 68) if quick else LARGE if place in TARGET_PLACES else SMALL
+        size = (120, 68) if quick else LARGE if place.name in {case for case, *_ in TARGETS} else SMALL
         rows += place_rows(place, size, spp, frames, settled, device)
     rows += target_rows(rows)
     return [*rows, *({"table": "combinations: paper", "case": case, "says": text} for case, text in PAPER)]

@@ -169,7 +169,7 @@ def join_lights(
 
 
 SMALLEST_MOMENT = wp.constant(wp.float32(1.0e-30))
-EXPLORATION_PRICE = wp.constant(wp.float32(0.1))
+EXPLORATION_PRICE = wp.constant(wp.float32(0.1))  # of the error, that all samples' exploring is worth
 MOST_TRIES = wp.constant(wp.float32(32.0))  # that are remembered of a light
 
 
@@ -201,8 +201,8 @@ FADING = wp.constant(wp.float32(0.8))  # of moments, each frame
 
 
 # Share of samples that explore. What exploring brings, of lights that the cache does not offer, varies with moments[1]
-# over the share, and the rest with at most moments[0]. The share is that for which the former is a quarter of the
-# share times the latter, about what exploring costs.
+# over the share, and the rest with at most moments[0]. The share is that for which the former is EXPLORATION_PRICE
+# times the share times the latter: somewhat less than exploring costs, as unknown lights make outliers.
 @wp.func
 def exploration_share(moments: wp.vec2, settings: CacheSettings) -> wp.float32:
     share = settings.least_exploration
