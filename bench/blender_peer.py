@@ -22,7 +22,7 @@ import numpy as np
 import warp_gi as gi
 from warp_gi import launch, metrics
 from warp_gi.bench import presets
-from warp_gi.bench.stages import Row
+from warp_gi.bench.measure import Row
 from warp_gi.exr import read_exr
 
 PYTHON = os.environ.get("WARP_GI_BLENDER_PYTHON", sys.executable)

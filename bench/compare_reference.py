@@ -12,7 +12,7 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi import launch, metrics
-from warp_gi.bench.stages import Row
+from warp_gi.bench.measure import Row
 from warp_gi.cli_compare import read_image
 from warp_gi.errors import OptionError, SceneError
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from warp_gi.bench.compare import Comparison, Run, seconds_to
-from warp_gi.bench.stages import Row, median_and_spread
+from warp_gi.bench.measure import Row, median_and_spread
 
 SERIES = "error over time"
 """Table of the points that plots are drawn of; too long to print."""

@@ -15,8 +15,7 @@ from pathlib import Path
 import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench.compare_reference import StillFrames
-from warp_gi.bench.path import peak_memory
-from warp_gi.bench.stages import Row, timed
+from warp_gi.bench.measure import Row, peak_memory, timed
 from warp_gi.errors import GiError
 
 

@@ -18,7 +18,7 @@ import warp as wp
 import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench.compile_cuda import kernel_modules
-from warp_gi.bench.stages import Row
+from warp_gi.bench.measure import Row
 
 OBJECTS = (".o", ".obj", ".cubin", ".ptx")
 FRAME = "first frame"

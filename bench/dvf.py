@@ -12,7 +12,8 @@ from typing import Any
 
 from warp_gi.bench import dvf_peers, runner
 from warp_gi.bench.dvf_views import PLACES, FieldStage, View, glossy, quality
-from warp_gi.bench.stages import Place, Row, race, rmse
+from warp_gi.bench.measure import Row
+from warp_gi.bench.stages import Place, race, rmse
 
 SPP = 64
 CARD = "RTX 3080"

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,15 +17,16 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.bench import path, presets, rays
+from warp_gi.bench import mitsuba_peer, path, presets, rays, scatter
 from warp_gi.bench.dvf_views import PLACES, WHITE
-from warp_gi.bench.mitsuba_peer import PeerMissing, load_mitsuba, to_mitsuba
-from warp_gi.bench.stages import Place, Row, timed_bake
+from warp_gi.bench.measure import Row, Taken, peak_memory, take_turns
+from warp_gi.bench.stages import Place, timed_bake
 from warp_gi.bvh import TriangleBvh
 from warp_gi.scene import harmonics
 
 SPP = 64
 RMSE = 0.01
+KINDS = ("wall", "cpu")
 TARGETS = "4 / 2.5 / 1.8"
 EQUAL_ERROR_PLACES = ("Sponza", "atrium", "street", "Bistro")
 OURS: dict[str, Any] = {
@@ -99,27 +100,35 @@ def equal_error(
             renderers[name] = _ours(scene, camera, estimator, device)
     if with_mitsuba:
         try:
-            mi = load_mitsuba()
-            peer = to_mitsuba(scene, camera)
             for name, integrator in MITSUBA.items():
-                renderers[name] = _theirs(mi, peer, mi.load_dict(integrator))
-        except PeerMissing as missing:
+                renderers[name] = mitsuba_peer.renderer(scene, camera, integrator, SPP)
+        except mitsuba_peer.PeerMissing as missing:
             rows.append({"table": "equal error", "case": place.name, "sky": sky, "skipped": str(missing)})
-    times, images = path.measure(renderers)
-    scatter = {name: float(np.sqrt(np.mean(np.var(images[name], axis=0, ddof=1)))) for name in renderers}
-    factors = {name: (scatter[name] / RMSE) ** 2 for name in renderers}
-    best = min((times[name][1] * factors[name] for name in renderers if name in MITSUBA), default=None)
-    best_wall = min((times[name][0] * factors[name] for name in renderers if name in MITSUBA), default=None)
-    for name in renderers:
-        wall, cpu = times[name]
-        row: Row = {"table": "equal error", "case": place.name, "sky": sky, "renderer": name, "wall s": wall}
-        row |= {"cpu s": cpu, "RMSE": scatter[name]}
-        row |= {f"wall s to {RMSE}": wall * factors[name], f"cpu s to {RMSE}": cpu * factors[name]}
-        if best is not None and best_wall is not None:
-            row["times mitsuba, wall"] = best_wall / row[f"wall s to {RMSE}"]
-            row["times mitsuba, cpu"] = best / row[f"cpu s to {RMSE}"]
+    taken = take_turns(renderers, path.REPETITIONS, device, keep=path.REPETITIONS, pause=path.PAUSE)
+    return rows + equal_error_table(place.name, sky, taken)
+
+
+def equal_error_table(case: str, sky: str, taken: Mapping[str, Taken[np.ndarray]]) -> list[Row]:
+    """Return a row for each renderer that took turns; squared errors fall as 1/n, so errors at equal time follow.
+
+    Equal time is that of tracing all.
+    """
+    pictures = {name: one.results for name, one in taken.items()}
+    found = {name: scatter.errors(pictures, name) for name in pictures}
+    factors = {name: (errors["RMSE"] / RMSE) ** 2 for name, errors in found.items()}
+    peers = [name for name in taken if name in MITSUBA]
+    best = {kind: min((factors[n] * taken[n].times[i] for n in peers), default=None) for i, kind in enumerate(KINDS)}
+    rows: list[Row] = []
+    for name, one in taken.items():
+        row: Row = {"table": "equal error", "case": case, "sky": sky, "renderer": name, **one.row(), **found[name]}
+        row["RMSE at equal time"] = row["RMSE"] * (one.cost / taken["traced"].cost) ** 0.5
+        for kind, seconds in zip(KINDS, one.times, strict=True):
+            row[f"{kind} s to {RMSE}"] = seconds * factors[name]
+        for kind in KINDS if peers else ():
+            row[f"times mitsuba, {kind}"] = best[kind] / row[f"{kind} s to {RMSE}"]
+        if peers:
             row["targets"] = TARGETS
-        row["mean / traced"] = float(np.mean(images[name]) / np.mean(images["traced"]))
+        row["mean / traced"] = float(np.mean(pictures[name]) / np.mean(pictures["traced"]))
         rows.append(row)
     return rows
 
@@ -129,10 +138,6 @@ def _ours(scene: gi.Scene, camera: gi.Camera, estimator: Any, device: str) -> Ca
     pipeline = gi.Pipeline(environment=estimator, **settings)
     scheduler = gi.FrameScheduler(scene, gi.CameraPath.still(camera), pipeline, device)
     return lambda index: scheduler.frame(index).numpy("beauty").copy()
-
-
-def _theirs(mi: Any, peer: Any, integrator: Any) -> Callable[[int], np.ndarray]:
-    return lambda index: np.array(mi.render(peer, integrator=integrator, spp=SPP, seed=index))
 
 
 # ---- bakes ----
@@ -203,9 +208,9 @@ def _child_main(width: str, height: str, frames: str, device: str) -> None:
     wp.init()
     scene = presets.sponza(WHITE)
     scene.data(device)
-    before = path.peak_memory()
+    before = peak_memory()
     bake, (wall, cpu) = timed_bake(scene, gi.VisibilityField(), device, flight((int(width), int(height)), int(frames)))
-    row: Row = {"wall s": wall, "cpu s": cpu, "peak GB": path.peak_memory() / 1e9, "peak GB before": before / 1e9}
+    row: Row = {"wall s": wall, "cpu s": cpu, "peak GB": peak_memory() / 1e9, "peak GB before": before / 1e9}
     row |= {name: bake.counts[name] for name in ("cells", "samples", "rays", "rays_traced")}
     with tempfile.TemporaryDirectory() as folder:
         row["file MB"] = bake.save(Path(folder) / "bake.safetensors").stat().st_size / 1e6

@@ -11,7 +11,8 @@ import warp as wp
 import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench import presets
-from warp_gi.bench.stages import Place, Row, Stage, Times, rmse, timed_bake
+from warp_gi.bench.measure import Row, Times
+from warp_gi.bench.stages import Place, Stage, rmse, timed_bake
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_audit as audit_kernels
 from warp_gi.techniques.visibility_state import FieldState

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import glob
 import os
+from collections.abc import Callable
 from ctypes.util import find_library
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -30,12 +31,22 @@ class PeerMissing(RuntimeError):
     """Mitsuba, or the LLVM that its fast variant compiles with, is not installed."""
 
 
-@cache
-def load_mitsuba(variant: str = "llvm_ad_rgb") -> Any:
-    """Return the module ``mitsuba`` with ``variant`` set; the first call of a process decides the variant.
+LLVM, SCALAR = "llvm_ad_rgb", "scalar_rgb"
+"""Variants: kernels compiled for vectors, and a ray at a time."""
+
+
+def load_mitsuba(variant: str = LLVM) -> Any:
+    """Return the module ``mitsuba`` with ``variant`` set, which stays so until another is loaded.
 
     Finds LLVM 19 unless DRJIT_LIBLLVM_PATH names one. Raises PeerMissing with what to install.
     """
+    mitsuba = _started(variant)
+    mitsuba.set_variant(variant)
+    return mitsuba
+
+
+@cache
+def _started(variant: str) -> Any:
     if variant.startswith("llvm") and not os.environ.get("DRJIT_LIBLLVM_PATH"):
         found = sorted(path for pattern in LLVM_PATTERNS for path in glob.glob(pattern))
         library = found[0] if found else find_library("LLVM-19")
@@ -53,6 +64,19 @@ def load_mitsuba(variant: str = "llvm_ad_rgb") -> Any:
     mitsuba.set_log_level(mitsuba.LogLevel.Error)
     _register(mitsuba)
     return mitsuba
+
+
+def renderer(
+    scene: gi.Scene, camera: gi.Camera, integrator: dict[str, Any], spp: int, variant: str = LLVM
+) -> Callable[[int], np.ndarray]:
+    """Return what renders float32 [height, width, 3] for a seed; raises as ``to_mitsuba``."""
+    mi = load_mitsuba(variant)
+    peer, method = to_mitsuba(scene, camera, variant), mi.load_dict(integrator)
+
+    def render(seed: int) -> np.ndarray:
+        return np.array(load_mitsuba(variant).render(peer, integrator=method, spp=spp, seed=seed))
+
+    return render
 
 
 def _register(mi: Any) -> None:
@@ -153,13 +177,13 @@ def _register(mi: Any) -> None:
     mi.register_texture("coverage", Coverage)
 
 
-def to_mitsuba(scene: gi.Scene, camera: gi.Camera) -> Any:
+def to_mitsuba(scene: gi.Scene, camera: gi.Camera, variant: str = LLVM) -> Any:
     """Return ``scene`` at its current time seen by ``camera`` as a ``mi.Scene``: box filter, independent sampler.
 
     Raises PeerMissing without Mitsuba, and ValueError for what it has no equal for: normal
     maps, emission by texture or on both sides, punctual lights.
     """
-    mi = load_mitsuba()
+    mi = load_mitsuba(variant)
     geometry = scene.data("cpu").geometry
     arrays = {name: getattr(geometry, name).numpy() for name in ("points", "normals", "uvs", "indices", "materials")}
     parts: dict[str, Any] = {"type": "scene", "sensor": _sensor(mi, camera)}

@@ -1,8 +1,8 @@
-"""Speed of the whole: path tracing and direct sky light beside Mitsuba 3 llvm_ad_rgb; first frames; memory.
+"""Speed of the whole: path tracing and direct light beside Mitsuba 3, LLVM and scalar; first frames; memory.
 
-``python -m warp_gi.bench.path [--quick]``. Both renderers get the same triangles, Lambert
+``python -m warp_gi.bench.path [--quick]``. All renderers get the same triangles, Lambert
 materials without alpha masks, samples and depth, take turns in one process, and have
-compiled before the clock starts. Both are unbiased (the tests see to that), so the error
+compiled before the clock starts. All are unbiased (the tests see to that), so the error
 of a picture is its scatter over repetitions with independent seeds.
 """
 
@@ -11,26 +11,27 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import warp_gi as gi
-from warp_gi.bench import presets, runner
-from warp_gi.bench.mitsuba_peer import PeerMissing, load_mitsuba, to_mitsuba
-from warp_gi.metrics import RELATIVE_EPSILON
+from warp_gi.bench import mitsuba_peer, presets, runner, scatter
+from warp_gi.bench.measure import Row, Taken, peak_memory, ratio_and_spread, take_turns
 
-Row = dict[str, Any]
-REPETITIONS = 6
+REPETITIONS, QUICK_REPETITIONS = 6, 3
+SPP = 64
+PAUSE = 0.2
+"""Seconds before a turn, in which the other renderer's threads go to sleep."""
+OURS = "ours"
+VARIANTS = (mitsuba_peer.LLVM, mitsuba_peer.SCALAR)
 CAMERA_SAMPLES = 8
 """Camera rays a pixel that our 64 samples share; Mitsuba's have one each."""
 
@@ -62,6 +63,7 @@ _lit_room, _open_room = partial(presets.living_room, lamp=True), partial(presets
 CASES = (
     Case("Sponza, white sky, depth 4", _white_sponza, presets.SPONZA_VIEW, 4, _SPONZA, _path(4)),
     Case("living room, lamp, depth 4", _lit_room, presets.LIVING_ROOM_VIEW, 4, _LIVING_ROOM, _path(4)),
+    Case("living room, lamp, direct", _lit_room, presets.LIVING_ROOM_VIEW, 2, _LIVING_ROOM, _path(2)),
     Case("Sponza, white sky, direct", _white_sponza, presets.SPONZA_VIEW, 2, _SPONZA, _BSDF_ONLY),
     Case("living room, white sky, direct", _open_room, presets.LIVING_ROOM_VIEW, 2, _LIVING_ROOM, _BSDF_ONLY),
     Case(
@@ -88,52 +90,68 @@ def pipeline(max_depth: int, spp: int) -> gi.Pipeline:
 
 
 def compare(case: Case, quick: bool, device: str) -> list[Row]:
-    """Return a row of seconds and a row of errors for one case, at 64 samples a pixel."""
+    """Return rows of one case at 64 samples a pixel: each renderer's, at equal time and error, and beside peers."""
     missing = [name for name in case.files if not (presets.SCENES / name).exists()]
     if missing:
         return [{"case": case.name, "skipped": f"no {presets.SCENES / missing[0]}; set WARP_GI_SCENES"}]
-    spp, size = 64, (240, 135) if quick else (480, 270)
+    size, repetitions = ((240, 135), QUICK_REPETITIONS) if quick else ((480, 270), REPETITIONS)
     camera = case.camera.at_resolution(*size)
     scene = presets.peer_scene(case.scene(), diffuse=True, masks=False)
-    scheduler = gi.FrameScheduler(scene, gi.CameraPath.still(camera), pipeline(case.max_depth, spp), device)
-    renderers = {"ours": lambda i: scheduler.frame(i).numpy("beauty").copy()}
+    scheduler = gi.FrameScheduler(scene, gi.CameraPath.still(camera), pipeline(case.max_depth, SPP), device)
+    renderers = {OURS: lambda index: scheduler.frame(index).numpy("beauty").copy()}
     rows: list[Row] = []
-    try:
-        mi = load_mitsuba()
-        peer, integrator = to_mitsuba(scene, camera), mi.load_dict(case.peer)
-        renderers["mitsuba"] = lambda i: np.array(mi.render(peer, integrator=integrator, spp=spp, seed=i))
-    except PeerMissing as missing_peer:
-        rows.append({"case": case.name, "skipped": str(missing_peer)})
-    times, images = measure(renderers)
-    mean = np.mean([x for name in images for x in images[name]], axis=0)
-    speed: Row = {"case": case.name, "pixels": f"{size[0]}x{size[1]}", "spp": spp}
-    error: Row = {"case": case.name}
-    for name in renderers:
-        speed[f"{name} wall s"], speed[f"{name} cpu s"] = times[name]
-        variance = np.var(images[name], axis=0, ddof=1)
-        error[f"{name} relMSE"] = float(np.mean(variance / (mean**2 + RELATIVE_EPSILON)))
-    if "mitsuba" in renderers:
-        speed["faster, wall"] = speed["mitsuba wall s"] / speed["ours wall s"]
-        speed["faster, cpu"] = speed["mitsuba cpu s"] / speed["ours cpu s"]
-        error["error ratio"] = error["ours relMSE"] / error["mitsuba relMSE"]
-        error["faster at equal error, cpu"] = speed["faster, cpu"] / error["error ratio"]
-        error["means differ"] = float(np.mean(images["ours"]) / np.mean(images["mitsuba"]) - 1)
-    return [*rows, speed, error]
+    for variant in VARIANTS:
+        try:
+            renderers[f"mitsuba {variant}"] = mitsuba_peer.renderer(scene, camera, case.peer, SPP, variant)
+        except mitsuba_peer.PeerMissing as missing_peer:
+            rows.append({"case": case.name, "skipped": str(missing_peer)})
+    taken = take_turns(renderers, repetitions, device, keep=repetitions, pause=PAUSE)
+    return rows + rows_of(case.name, size, taken)
 
 
-def measure(renderers: dict[str, Callable[[int], np.ndarray]]) -> tuple[dict[str, tuple[float, float]], dict[str, Any]]:
-    """Return median (wall, CPU) seconds and all pictures of each renderer, which take turns."""
-    times: dict[str, list[tuple[float, float]]] = {name: [] for name in renderers}
-    images: dict[str, list[np.ndarray]] = {name: [] for name in renderers}
-    for name in renderers:
-        renderers[name](0)  # compiles
-    for index in range(1, REPETITIONS + 1):
-        for name, render in renderers.items():
-            time.sleep(0.2)  # lets the other's threads go to sleep
-            wall, cpu = time.perf_counter(), time.process_time()
-            images[name].append(render(index))
-            times[name].append((time.perf_counter() - wall, time.process_time() - cpu))
-    return {name: tuple(np.median(times[name], axis=0).tolist()) for name in renderers}, images
+def rows_of(case: str, size: tuple[int, int], taken: Mapping[str, Taken[np.ndarray]]) -> list[Row]:
+    """Return rows of renderers that took turns, ours first: equal samples, equal time, equal error, and ratios."""
+    pictures = {name: one.results for name, one in taken.items()}
+    about: Row = {"case": case, "pixels": f"{size[0]}x{size[1]}", "spp": SPP}
+    equal_samples = {
+        name: {"table": "equal samples", **about, "renderer": name, **one.row(), **scatter.errors(pictures, name)}
+        for name, one in taken.items()
+    }
+    ours, rows = equal_samples[OURS], list(equal_samples.values())
+    for name, row in equal_samples.items():
+        rows.append(_equal_time_row(case, name, row, taken[name].cost, taken[OURS].cost))
+    for name, row in equal_samples.items():
+        rows.append(_equal_error_row(case, name, row, ours["relMSE"]))
+    for name in (name for name in taken if name != OURS):
+        row = {"table": "beside peers", "case": case, "peer": name}
+        for kind in ("wall", "cpu"):
+            row |= ratio_and_spread(f"faster, {kind}", getattr(taken[name], kind), getattr(taken[OURS], kind))
+        row["error ratio"] = ours["relMSE"] / equal_samples[name]["relMSE"]
+        for kind in ("wall", "cpu"):
+            row[f"faster at equal error, {kind}"] = row[f"faster, {kind}"] / row["error ratio"]
+        rows.append(row | {"means differ": float(np.mean(pictures[OURS]) / np.mean(pictures[name]) - 1)})
+    return rows
+
+
+def _equal_time_row(case: str, name: str, row: Row, seconds: float, ours: float) -> Row:
+    """Return what a renderer makes of the seconds that our picture takes, by the law that squared errors fall as 1/n.
+
+    Independent samples keep to it; ours are stratified and fall a little faster.
+    """
+    samples = ours / seconds
+    found: Row = {"table": "equal time", "case": case, "renderer": name, "s": ours, "samples a pixel": SPP * samples}
+    return found | {"RMSE": row["RMSE"] / samples**0.5, "relMSE": row["relMSE"] / samples}
+
+
+def _equal_error_row(case: str, name: str, row: Row, target: float) -> Row:
+    """Return what a renderer takes to get to our relMSE, by the same law."""
+    samples = row["relMSE"] / target
+    found: Row = {"table": "equal error", "case": case, "renderer": name, "relMSE": target}
+    return found | {
+        "samples a pixel": SPP * samples,
+        "wall s": row["wall s"] * samples,
+        "cpu s": row["cpu s"] * samples,
+    }
 
 
 # ---- in processes of their own ----
@@ -146,14 +164,14 @@ def first_frames(device: str) -> list[Row]:
         with tempfile.TemporaryDirectory() as cache:
             for state in ("cold", "warm"):
                 row = _child(scene, (480, 270), 16, device, cache)
-                rows.append({"case": f"first frame of {scene}, {state} kernel cache"} | row)
+                rows.append({"table": "first frame", "case": f"first frame of {scene}, {state} kernel cache"} | row)
     return rows
 
 
 def bistro_memory(device: str, quick: bool) -> list[Row]:
     """Return the peak resident memory of rendering the Bistro at 960x540."""
     row = _child("bistro_exterior.glb", (960, 540), 2 if quick else 16, device, None)
-    return [{"case": "Bistro at 960x540"} | row]
+    return [{"table": "memory", "case": "Bistro at 960x540"} | row]
 
 
 def _child(scene: str, size: tuple[int, int], spp: int, device: str, cache: str | None) -> Row:
@@ -207,15 +225,6 @@ def _child_main(scene: str, width: str, height: str, spp: str, device: str) -> N
     seconds = {"scene s": built - started, "frame s": finished - built}
     seconds |= {"compile s": frame.timings.get("compile", 0.0), "cpu s": time.process_time()}
     print(json.dumps({"finished": finished, **seconds, "peak GB": peak_memory() / 1e9}))
-
-
-def peak_memory() -> float:
-    """Return the most bytes of memory this process has had resident."""
-    try:
-        status = Path("/proc/self/status").read_text(encoding="ascii")
-        return 1024.0 * int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1])
-    except (OSError, StopIteration):  # not Linux; a fork's getrusage may count its parent, which VmHWM does not
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0)
 
 
 def main() -> None:

@@ -9,10 +9,10 @@ from __future__ import annotations
 import argparse
 
 from warp_gi.bench import runner
+from warp_gi.bench.measure import Row
 from warp_gi.bench.probes_denoise import denoise_rows
 from warp_gi.bench.probes_light import bake_rows, leak_rows, light_rows
 from warp_gi.bench.probes_rays import ray_rows
-from warp_gi.bench.stages import Row
 
 PARTS = {"rays": ray_rows, "leaks": leak_rows, "light": light_rows, "bakes": bake_rows, "denoise": denoise_rows}
 

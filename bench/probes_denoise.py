@@ -9,7 +9,7 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi.bench import presets
-from warp_gi.bench.stages import Row
+from warp_gi.bench.measure import Row
 from warp_gi.errors import OptionError
 
 FRAME = 7

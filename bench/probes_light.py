@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 import warp_gi as gi
+from warp_gi.bench.measure import Row, cost, timed
 from warp_gi.bench.probes_views import (
     CORNELL,
     CYLINDERS,
@@ -18,7 +19,7 @@ from warp_gi.bench.probes_views import (
     cylinder_box,
     view_of,
 )
-from warp_gi.bench.stages import Place, Row, Stage, cost, race, timed
+from warp_gi.bench.stages import Place, Stage, race
 from warp_gi.techniques.light_field_places import lit_data
 
 SPP = 4

@@ -11,8 +11,9 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi import launch
+from warp_gi.bench.measure import Row, cost
 from warp_gi.bench.probes_views import CORNELL, LIVING_ROOM, SPONZA, View, view_of
-from warp_gi.bench.stages import Place, Row, cost, race
+from warp_gi.bench.stages import Place, race
 from warp_gi.kernels import light_field_march as march_kernels
 from warp_gi.techniques.light_field_ray import march_rays
 

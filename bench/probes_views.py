@@ -11,7 +11,8 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi.bench import presets
-from warp_gi.bench.stages import Place, Row, Stage, Times, timed_bake
+from warp_gi.bench.measure import Row, Times
+from warp_gi.bench.stages import Place, Stage, timed_bake
 from warp_gi.metrics import RELATIVE_EPSILON
 
 MAX_DEPTH = 16

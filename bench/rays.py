@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import warp as wp
@@ -24,10 +24,11 @@ import warp as wp
 from warp_gi import bvh as bvh_module
 from warp_gi import launch
 from warp_gi.bench import presets, runner
+from warp_gi.bench.measure import PeakMemory, Row, Taken, median_and_spread, ratio_and_spread, take_turns
 from warp_gi.bvh import TriangleBvh
 from warp_gi.errors import unknown_name
 
-Row = dict[str, Any]
+T = TypeVar("T")
 REPETITIONS = 5
 RAYS = 1_000_000
 QUICK_RAYS = 200_000
@@ -92,20 +93,20 @@ def compare(
         rows = [row]
         for kind, (origins, directions) in batches.items():
             for query in ("any", "closest"):
-                row = {"scene": name, "triangles": len(indices), "rays": kind, "query": query}
+                row = {"table": "rays", "scene": name, "triangles": len(indices), "rays": kind, "query": query}
                 row |= race(query, tree, mesh, peers, origins, directions, repetitions)
                 if found.is_cpu and threads > 1:
                     row |= scaling(tree, query, origins, directions, repetitions)
                 rows.append(row)
     finally:
-        launch.set_threads(None)
+        launch.set_threads(threads)
     return rows
 
 
 def build_all(name: str, points: np.ndarray, indices: np.ndarray, device: str, repetitions: int) -> tuple:
     """Return our tree, a wp.Mesh, Embree's scenes by name, and the row of build times (CPU seconds)."""
     TriangleBvh(points, indices[:100], device)  # compiles
-    row: Row = {"scene": name, "triangles": len(indices)}
+    row, peak = {"table": "builds", "scene": name, "triangles": len(indices)}, PeakMemory()
     builders: dict[str, Callable[[], object]] = {
         "ours": lambda: TriangleBvh(points, indices, device),
         "warp": lambda: warp_mesh(points, indices, device),
@@ -123,13 +124,23 @@ def build_all(name: str, points: np.ndarray, indices: np.ndarray, device: str, r
             return scene, mesh
 
         builders |= {name: partial(embree, robust) for name, robust in EMBREE.items()}
-    seconds, results = take_turns(builders, min(repetitions, 3))
-    for key, value in seconds.items():
-        row[f"{key} build s"] = value
-    for key in [name for name in EMBREE if name in seconds]:
-        row[f"{key} / ours"] = seconds[key] / seconds["ours"]
-    row["bytes a triangle"] = results["ours"].memory_bytes / len(indices)
-    return results.pop("ours"), results.pop("warp"), results, row
+    built = take_turns({name: _ignoring(build) for name, build in builders.items()}, min(repetitions, 3), device, 1)
+    for key, taken in built.items():
+        row |= median_and_spread(f"{key} build s", _counting(key, taken))
+    for key in [name for name in EMBREE if name in built]:
+        row |= ratio_and_spread(f"{key} / ours", built[key].cpu, built["ours"].counting)
+    row["bytes a triangle"] = built["ours"].results[0].memory_bytes / len(indices)
+    results = {key: taken.results[0] for key, taken in built.items()}
+    return results.pop("ours"), results.pop("warp"), results, row | peak.row()
+
+
+def _counting(name: str, taken: Taken[Any]) -> list[float]:
+    """Return the seconds that count; Embree runs on the CPU whatever the device is."""
+    return taken.cpu if name in EMBREE else taken.counting
+
+
+def _ignoring(work: Callable[[], T]) -> Callable[[int], T]:
+    return lambda turn: work()
 
 
 def warp_mesh(points: np.ndarray, indices: np.ndarray, device: str) -> wp.Mesh:
@@ -176,16 +187,18 @@ def race(
         return faces.numpy()
 
     runners["warp"] = warp_query
-    seconds, results = take_turns(runners, repetitions)
-    row: Row = {f"{key} Mrays/s": len(origins) / value / 1e6 for key, value in seconds.items()}
-    for key in peers:
-        row[f"ours / {key}"] = seconds[key] / seconds["ours"]
-        row[f"in order / {key}"] = seconds[key] / seconds["ours in order"]
+    taken = take_turns({name: _ignoring(run) for name, run in runners.items()}, repetitions, device.alias, 1)
+    rates = {name: [len(origins) / seconds / 1e6 for seconds in _counting(name, one)] for name, one in taken.items()}
+    row: Row = {}
+    for key, values in rates.items():
+        row |= median_and_spread(f"{key} Mrays/s", values)
+    for key in (*peers, "warp"):
+        row |= ratio_and_spread(f"ours / {key}", rates["ours"], rates[key])
+        row |= ratio_and_spread(f"in order / {key}", rates["ours in order"], rates[key])
+    row["ours Mrays/wall s"] = len(origins) / taken["ours"].times[0] / 1e6
     if peers:
-        found = results["embree"] == 0 if query == "any" else results["embree"]
-        row["agree"] = float((found == results["ours"]).mean())
-    row["ours / warp"] = seconds["warp"] / seconds["ours"]
-    row["in order / warp"] = seconds["warp"] / seconds["ours in order"]
+        found, faces = (taken[name].results[0] for name in ("embree", "ours"))
+        row["agree"] = float(((found == 0 if query == "any" else found) == faces).mean())
     return row
 
 
@@ -194,18 +207,6 @@ def trace(tree: TriangleBvh, query: str, origins: np.ndarray, directions: np.nda
     if query == "any":
         return tree.occluded(origins, directions).numpy()
     return tree.intersect(origins, directions).face.numpy()
-
-
-def take_turns(runners: dict[str, Callable[[], Any]], repetitions: int) -> tuple[dict[str, float], dict[str, Any]]:
-    """Return median CPU seconds and the first result of each."""
-    seconds: dict[str, list[float]] = {name: [] for name in runners}
-    results: dict[str, list[Any]] = {name: [] for name in runners}
-    for _ in range(repetitions):
-        for name, runner_ in runners.items():
-            started = time.process_time()
-            results[name].append(runner_())
-            seconds[name].append(time.process_time() - started)
-    return {name: float(np.median(values)) for name, values in seconds.items()}, {k: v[0] for k, v in results.items()}
 
 
 def scaling(tree: TriangleBvh, query: str, origins: np.ndarray, directions: np.ndarray, repetitions: int) -> Row:

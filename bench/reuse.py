@@ -10,10 +10,10 @@ from __future__ import annotations
 import argparse
 
 from warp_gi.bench import runner
+from warp_gi.bench.measure import Row
 from warp_gi.bench.reuse_cost import cost_rows
 from warp_gi.bench.reuse_quality import quality_rows
 from warp_gi.bench.reuse_time import adaptation_rows, strobe_rows, turning_rows
-from warp_gi.bench.stages import Row
 
 PARTS = {
     "quality": quality_rows,

@@ -7,8 +7,9 @@ from typing import Any
 import warp as wp
 
 import warp_gi as gi
+from warp_gi.bench.measure import Row
 from warp_gi.bench.reuse_views import MINE, WAREHOUSE, FrameRun, Truth, run_sequences
-from warp_gi.bench.stages import Place, Row
+from warp_gi.bench.stages import Place
 
 CARD = "RTX 2080 Ti, 1920x1080"
 TARGET_SHARE = 0.08

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import warp_gi as gi
+from warp_gi.bench.measure import Row
 from warp_gi.bench.reuse_views import (
     BISTRO,
     CORNELL,
@@ -20,7 +21,7 @@ from warp_gi.bench.reuse_views import (
     ratio,
     run_sequences,
 )
-from warp_gi.bench.stages import Place, Row
+from warp_gi.bench.stages import Place
 
 EMITTERS: dict[str, type] = {
     "LightHierarchy": gi.LightHierarchy,

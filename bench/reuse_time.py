@@ -8,6 +8,7 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi.bench import presets
+from warp_gi.bench.measure import Row
 from warp_gi.bench.reuse_views import (
     RING,
     SEED,
@@ -22,7 +23,7 @@ from warp_gi.bench.reuse_views import (
     settled_at,
     written,
 )
-from warp_gi.bench.stages import Place, Row
+from warp_gi.bench.stages import Place
 
 LAST = 30
 """Frame up to which adaptation is watched."""

@@ -11,7 +11,8 @@ import numpy as np
 import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench import presets
-from warp_gi.bench.stages import Place, Times, cost
+from warp_gi.bench.measure import Times, cost
+from warp_gi.bench.stages import Place
 
 MEASURED = ("emitters", "indirect", "beauty")
 SEED = 11

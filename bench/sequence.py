@@ -19,8 +19,7 @@ import numpy as np
 
 from warp_gi import launch
 from warp_gi.bench import blender_peer
-from warp_gi.bench.path import peak_memory
-from warp_gi.bench.stages import Row, median_and_spread
+from warp_gi.bench.measure import Row, median_and_spread, peak_memory
 from warp_gi.cli_report import Reporter, start_warp
 
 SCENE = "atrium"

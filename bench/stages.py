@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,13 +10,9 @@ import numpy as np
 import warp as wp
 
 import warp_gi as gi
-from warp_gi import launch
 from warp_gi.bench import presets
+from warp_gi.bench.measure import Times, take_turns, timed
 from warp_gi.pipeline import TERMS
-
-Row = dict[str, Any]
-Times = tuple[float, float]
-"""Wall and CPU seconds."""
 
 
 @dataclass(frozen=True)
@@ -68,44 +63,16 @@ class Stage:
         wp.synchronize_device(self.frame.device)
 
 
-def timed(work: Callable[[], Any]) -> tuple[Any, Times]:
-    """Return what ``work`` does, and seconds without compilation."""
-    compiled, wall, cpu = launch.compile_seconds, time.perf_counter(), time.process_time()
-    result = work()
-    wp.synchronize()
-    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    compiled = launch.compile_seconds - compiled
-    return result, (wall - compiled, max(cpu - compiled, 0.0))
-
-
 def timed_bake(scene: gi.Scene, estimator: Any, device: str, camera: Any = None) -> tuple[gi.Bake, Times]:
     """Return what the camera, or path, makes the estimator bake, and seconds without compilation."""
     return timed(lambda: gi.bake(scene, estimator, device, camera_path=camera))
 
 
-def race(stages: Mapping[str, Stage | Callable[[], Any]], repetitions: int) -> dict[str, Times]:
+def race(stages: Mapping[str, Stage | Callable[[], Any]], repetitions: int, device: str = "cpu") -> dict[str, Times]:
     """Return the median seconds of each stage, or call; they take turns."""
-    times: dict[str, list[Times]] = {name: [] for name in stages}
-    for repetition in range(repetitions + 1):
-        for name, stage in stages.items():
-            wall, cpu = time.perf_counter(), time.process_time()
-            (stage.trace if isinstance(stage, Stage) else stage)()
-            wp.synchronize()
-            taken = time.perf_counter() - wall, time.process_time() - cpu
-            if repetition:  # the first warms the caches
-                times[name].append(taken)
-    return {name: tuple(np.median(values, axis=0).tolist()) for name, values in times.items()}
-
-
-def cost(times: Times, device: str) -> float:
-    """Return what counts of ``times``: CPU seconds on a CPU, of which others use some; wall seconds on a GPU."""
-    return times[1] if launch.get_device(device).is_cpu else times[0]
-
-
-def median_and_spread(name: str, values: Sequence[float]) -> Row:
-    """Return the median, and half of the range that the middle half of the values lie in."""
-    low, middle, high = np.percentile(values, (25, 50, 75))
-    return {name: float(middle), f"{name} spread": float(high - low) / 2}
+    works = {name: stage.trace if isinstance(stage, Stage) else stage for name, stage in stages.items()}
+    turns = {name: lambda index, work=work: work() for name, work in works.items()}
+    return {name: taken.times for name, taken in take_turns(turns, repetitions, device).items()}
 
 
 def rmse(a: np.ndarray, b: np.ndarray | float = 0.0) -> float:

@@ -1,0 +1,182 @@
+"""How benchmarks measure: contenders take turns in one process; wall, CPU and device seconds; peak memory.
+
+Compilation never counts. On CUDA a contender's time is also taken by events on the device, which leave out what the
+host does before and after.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
+from weakref import WeakSet
+
+import numpy as np
+import warp as wp
+
+from warp_gi import launch
+
+Row = dict[str, Any]
+Times = tuple[float, float]
+"""Wall and CPU seconds."""
+T = TypeVar("T")
+
+
+# ---- time ----
+
+
+@dataclass
+class Taken(Generic[T]):
+    """What the turns of one contender took, in seconds, and what the first of them returned."""
+
+    wall: list[float] = field(default_factory=list)
+    cpu: list[float] = field(default_factory=list)
+    device: list[float] = field(default_factory=list)
+    """By events on a CUDA device; empty on the CPU."""
+    results: list[T] = field(default_factory=list)
+
+    @property
+    def times(self) -> Times:
+        """Medians."""
+        return float(np.median(self.wall)), float(np.median(self.cpu))
+
+    @property
+    def counting(self) -> list[float]:
+        """The seconds that count: the device's own on CUDA, else the CPU's, as others use some of the wall's."""
+        return self.device or self.cpu
+
+    @property
+    def cost(self) -> float:
+        """The median of the seconds that count."""
+        return float(np.median(self.counting))
+
+    def row(self, prefix: str = "") -> Row:
+        """Return medians and spreads of wall, CPU and, on CUDA, device seconds."""
+        kinds = {"wall s": self.wall, "cpu s": self.cpu} | ({"device s": self.device} if self.device else {})
+        return {k: v for name, values in kinds.items() for k, v in median_and_spread(prefix + name, values).items()}
+
+    def add(self, work: Callable[[], T], device: str, keep: int) -> None:
+        """Do ``work`` once more; its result is kept if fewer than ``keep`` are."""
+        result, (wall, cpu), on_device = clocked(work, device)
+        self.wall.append(wall)
+        self.cpu.append(cpu)
+        if on_device is not None:
+            self.device.append(on_device)
+        if len(self.results) < keep:
+            self.results.append(result)
+
+
+def take_turns(
+    contenders: Mapping[str, Callable[[int], T]],
+    repetitions: int,
+    device: str = "cpu",
+    keep: int = 0,
+    pause: float = 0.0,
+    warm: bool = True,
+) -> dict[str, Taken[T]]:
+    """Let each contender do its work ``repetitions`` times, one after the other in each round.
+
+    They are called with the number of the round, from 1 on. ``warm`` calls each with 0 before, uncounted, which
+    compiles and fills caches. ``pause`` seconds before a turn let the threads of the one before go to sleep.
+    """
+    if warm:
+        for work in contenders.values():
+            work(0)
+    taken: dict[str, Taken[T]] = {name: Taken() for name in contenders}
+    for index in range(1, repetitions + 1):
+        for name, work in contenders.items():
+            time.sleep(pause)
+            taken[name].add(lambda work=work, index=index: work(index), device, keep)
+    return taken
+
+
+def clocked(work: Callable[[], T], device: str = "cpu") -> tuple[T, Times, float | None]:
+    """Return what ``work`` does, its wall and CPU seconds, and seconds between events around it on a CUDA device."""
+    found = launch.get_device(device)
+    events = [wp.Event(found, enable_timing=True) for _ in range(2)] if found.is_cuda else []
+    wp.synchronize()
+    compiled, wall, cpu = launch.compile_seconds, time.perf_counter(), time.process_time()
+    if events:
+        found.stream.record_event(events[0])
+    result = work()
+    if events:
+        found.stream.record_event(events[1])
+    wp.synchronize()
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    compiled = launch.compile_seconds - compiled
+    on_device = wp.get_event_elapsed_time(*events) / 1e3 if events else None
+    return result, (wall - compiled, max(cpu - compiled, 0.0)), on_device
+
+
+def timed(work: Callable[[], T]) -> tuple[T, Times]:
+    """Return what ``work`` does, and its wall and CPU seconds."""
+    return clocked(work)[:2]
+
+
+def cost(times: Times, device: str) -> float:
+    """Return what counts of ``times``: CPU seconds on a CPU, of which others use some; wall seconds on a GPU."""
+    return times[1] if launch.get_device(device).is_cpu else times[0]
+
+
+def median_and_spread(name: str, values: Sequence[float]) -> Row:
+    """Return the median, and half of the range that the middle half of the values lie in."""
+    low, middle, high = np.percentile(values, (25, 50, 75))
+    return {name: float(middle), f"{name} spread": float(high - low) / 2}
+
+
+def ratio_and_spread(name: str, above: Sequence[float], below: Sequence[float]) -> Row:
+    """Return the median and spread of the ratios, turn by turn: what slows the machine for a while slows both."""
+    return median_and_spread(name, np.asarray(above, np.float64) / np.asarray(below, np.float64))
+
+
+# ---- memory ----
+
+
+class PeakMemory:
+    """The most memory this process has had resident since this was made.
+
+    Where the system cannot start anew (it is not Linux), since the process began.
+    """
+
+    _live: ClassVar[WeakSet[PeakMemory]] = WeakSet()
+
+    def __init__(self) -> None:
+        before = peak_memory()
+        for other in PeakMemory._live:
+            other._seen = max(other._seen, before)
+        self._seen = 0.0
+        _forget_peak()
+        PeakMemory._live.add(self)
+
+    @property
+    def bytes(self) -> float:
+        """The peak so far."""
+        return max(self._seen, peak_memory())
+
+    def row(self) -> Row:
+        """Return the peak in GB, and on CUDA that of Warp's memory pools since the process began."""
+        found: Row = {"peak GB": self.bytes / 1e9}
+        pools = [wp.get_mempool_used_mem_high(d) for d in wp.get_cuda_devices() if wp.is_mempool_enabled(d)]
+        return found | ({"peak device GB": sum(pools) / 1e9} if pools else {})
+
+
+def peak_memory() -> float:
+    """Return the most bytes of memory this process has had resident, or since it was last made to forget."""
+    try:
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+        return 1024.0 * int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1])
+    except (OSError, StopIteration):  # not Linux; a fork's getrusage may count its parent, which VmHWM does not
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0)
+
+
+def _forget_peak() -> bool:
+    """Set the high-water mark to what is resident now; False where that cannot be done."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    except OSError:
+        return False
+    return True
