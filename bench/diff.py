@@ -19,6 +19,8 @@ SETTINGS = frozenset({"spp", "resolution", "rays a pixel", "degrees", "bits", "m
 MACHINE = ("cpu", "cores", "threads", "device")
 """Where these differ, times cannot be compared."""
 REMARKS = ("target", "targets", "says", "skipped", "failed")
+PEERS = ("mitsuba", "embree", "blender")
+"""What a row's renderer is called where it is not ours to be slower."""
 SPREADS = ("spread", "+-", "±")
 SERIES = re.compile(r"[-+.\deE]+(\s+[-+.\deE]+)+")
 """Numbers in words, an outcome."""
@@ -46,7 +48,7 @@ RULES: tuple[tuple[str, Measure | None], ...] = (
     (r"/ ?((wall|cpu) )?s$|\ba minute$", RATE),
     (r"\bagree|\bPSNR\b", ACCURACY),
     (r"\bequal time$|\b(time|cost|paths) / baseline$", TIME),
-    (r"\bequal samples$|/ baseline$|MSE\b|\bFLIP\b|\berrors?\b|\bwrong\b|\bbias\b", ERROR),
+    (r"\bequal samples$|/ baseline$|MSE\b|\bbad pixels\b|\bFLIP\b|\berrors?\b|\bwrong\b|\bbias\b", ERROR),
     (r"\b(bytes|[KMG]i?B)\b", MEMORY),
     (r"(^|[ (])(ns|us|µs|ms|s|seconds|minutes)($|[ ,)])", TIME),
 )
@@ -134,9 +136,9 @@ def _compare_rows(found: Difference, identity: Identity, old: records.Row, new: 
     found.only_old += [(identity, column) for column in before if column not in after]
     found.only_new += [(identity, column) for column in after if column not in before]
     same_machine = all(old.get(key) == new.get(key) for key in MACHINE)
-    is_quoted = "paper" in str(old.get("table", "")).lower()
+    is_others = "paper" in str(old.get("table", "")).lower() or str(old.get("renderer", "")).startswith(PEERS)
     for column in (column for column in before if column in after):
-        measure = None if is_quoted else measure_of(column)
+        measure = None if is_others else measure_of(column)
         if measure and measure.timed and not same_machine:
             found.void += 1
             continue

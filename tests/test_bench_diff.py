@@ -22,7 +22,8 @@ def names(changes):
 
 
 LOWER = """wall s | paths ms | seconds | ns a pixel | wall s to 0.01 | MSE beauty | ours relMSE | RMSE | ST FLIP
-    | error ratio | bytes a triangle | KB | peak GB | beauty / baseline | beauty, equal time | wrong per million"""
+    | error ratio | bytes a triangle | KB | peak GB | beauty / baseline | beauty, equal time | wrong per million
+    | bad pixels | device s | RMSE at equal time"""
 HIGHER = """Mrays/s | Mrays/wall s | faster, cpu | speed-up | x | faster at equal error, cpu | agree | ratio cpu
     | ours frames a minute | embree / ours | ours / embree | times mitsuba, wall"""
 NEITHER = """blender frames a minute | mitsuba wall s | embree Mrays/s | paper's method, ratio cpu | leaves
@@ -118,6 +119,13 @@ def test_the_papers_figures_are_never_worse():
     quoted = {"table": "times: paper, RTX 3080"}
     found = diff.compare([row(ms=1.0, **quoted)], [row(ms=2.0, **quoted)])
     assert found.worse == [] and names(found.changed) == ["ms"]
+
+
+@pytest.mark.parametrize("renderer, is_worse", [("ours", True), ("mitsuba llvm_ad_rgb", False), ("field, map", True)])
+def test_other_renderers_are_never_worse(renderer, is_worse):
+    found = diff.compare([row(renderer=renderer, RMSE=1.0)], [row(renderer=renderer, RMSE=2.0)])
+    assert names(found.worse if is_worse else found.changed) == ["RMSE"]
+    assert names(found.changed if is_worse else found.worse) == []
 
 
 # ---- the command ----
