@@ -8,11 +8,13 @@ alone, primary rays apart, except where a row says otherwise. What the paper mea
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from typing import Any
 
 from warp_gi.bench import dvf_peers, runner
 from warp_gi.bench.dvf_views import PLACES, FieldStage, View, glossy, quality
-from warp_gi.bench.measure import Row
+from warp_gi.bench.gallery import CLOSED, Gallery, PictureSet
+from warp_gi.bench.measure import Row, Taken, ratios
 from warp_gi.bench.stages import Place, race, rmse
 
 SPP = 64
@@ -32,23 +34,23 @@ MODES: dict[str, dict[str, Any]] = {
 }
 
 
-def run(quick: bool = False, device: str = "cpu") -> list[Row]:
+def run(quick: bool = False, device: str = "cpu", gallery: Gallery = CLOSED) -> list[Row]:
     """Return rows of all tables; ``quick`` takes a quarter of the pixels and two values of each setting."""
     rows: list[Row] = []
     for place in PLACES:
-        rows += place_rows(place, quick, device)
+        rows += place_rows(place, quick, device, gallery)
     rows += dvf_peers.equal_error_rows(quick, device)
     rows += dvf_peers.bake_rows(quick, device)
     return rows + dvf_peers.relight_rows(quick, device)
 
 
-def place_rows(place: Place, quick: bool, device: str) -> list[Row]:
+def place_rows(place: Place, quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
     """Return what is measured on one scene; the sweeps are Sponza's."""
     if place.missing:
         return [{"table": "modes", "case": place.name, "skipped": place.missing}]
     camera = place.camera().at_resolution(*((240, 135) if quick else (480, 270)))
     view, repetitions = View(place.scene(), camera, device, **place.settings), 3 if quick else 7
-    rows = mode_rows(place.name, view, repetitions, place.target)
+    rows = mode_rows(place.name, view, repetitions, place.target, gallery)
     if place.name in PAPER_KB:
         rows += sample_count_rows(place.name, view, repetitions, quick)
         rows += glossy_rows(place.name, view, repetitions)
@@ -57,22 +59,23 @@ def place_rows(place: Place, quick: bool, device: str) -> list[Row]:
     return rows
 
 
-def _faster(times: dict[str, tuple[float, float]], name: str) -> Row:
-    (wall, cpu), (base_wall, base_cpu) = times[name], times["traced"]
-    return {"wall s": wall, "cpu s": cpu, "ratio wall": base_wall / wall, "ratio cpu": base_cpu / cpu}
+def _faster(taken: Mapping[str, Taken[Any]], name: str) -> Row:
+    return taken[name].row() | ratios("ratio {}", taken["traced"], taken[name])
 
 
-def mode_rows(name: str, view: View, repetitions: int, target: float) -> list[Row]:
+def mode_rows(name: str, view: View, repetitions: int, target: float, gallery: Gallery = CLOSED) -> list[Row]:
     """Return a row for each mode at 64 samples a pixel, and one for all as in the paper."""
     stages: dict[str, FieldStage] = {"traced": view.stage(SPP, mode="traced")}
     stages |= {mode: view.stage(SPP, **settings) for mode, settings in MODES.items()}
     stages["paper, its settings"] = view.stage(SPP, **PAPER)
-    times = race(stages, repetitions)
+    taken = race(stages, repetitions, view.device)
     rows: list[Row] = []
     for mode, stage in stages.items():
         if mode != "traced":
-            row = {"table": "modes", "case": name, "mode": mode, "traced s": times["traced"][1]} | _faster(times, mode)
-            rows.append(row | {"target": target} | quality(stage, stages["traced"]))
+            row: Row = {"table": "modes", "case": name, "mode": mode, "traced s": taken["traced"].cost}
+            rows.append(row | _faster(taken, mode) | {"target": target} | quality(stage, stages["traced"]))
+    pictures = {mode: stage.picture for mode, stage in stages.items()}
+    gallery.add(PictureSet(f"{name}: light of the sky, {SPP} samples a pixel", pictures.pop("traced"), pictures))
     return rows
 
 
@@ -82,11 +85,11 @@ def sample_count_rows(name: str, view: View, repetitions: int, quick: bool) -> l
     for spp in (16, 64) if quick else PAPER_MS:
         stages = {"traced": view.stage(spp, mode="traced"), "field": view.stage(spp)}
         stages["paper, its settings"] = view.stage(spp, **PAPER)
-        times = race(stages, repetitions)
+        taken = race(stages, repetitions, view.device)
         row: Row = {"table": "table 1", "case": name, "spp": spp}
-        row |= {"without wall s": times["traced"][0], "without cpu s": times["traced"][1]} | _faster(times, "field")
+        row |= taken["traced"].row("without ") | _faster(taken, "field")
         row["RMSE"] = rmse(stages["field"].picture, stages["traced"].picture)
-        row["paper's method, ratio cpu"] = times["traced"][1] / times["paper, its settings"][1]
+        row["paper's method, ratio cpu"] = taken["traced"].cost / taken["paper, its settings"].cost
         rows.append(row)
         if name == "Sponza":
             without, with_ = PAPER_MS[spp]
@@ -100,9 +103,9 @@ def glossy_rows(name: str, view: View, repetitions: int) -> list[Row]:
     shiny, rows = view.with_scene(glossy(view.scene)), []
     stages = {"traced": shiny.stage(SPP, mode="traced")}
     stages |= {mode: shiny.stage(SPP, **MODES[mode]) for mode in ("three_state", "paper")}
-    times = race(stages, repetitions)
+    taken = race(stages, repetitions, view.device)
     for mode in ("three_state", "paper"):
-        row = {"table": "glossy", "case": name, "mode": mode, "traced s": times["traced"][1]} | _faster(times, mode)
+        row = {"table": "glossy", "case": name, "mode": mode, "traced s": taken["traced"].cost} | _faster(taken, mode)
         rows.append(row | {"RMSE": rmse(stages[mode].picture, stages["traced"].picture)})
     without, with_ = PAPER_GLOSSY_MS[name]
     paper: Row = {"table": f"glossy: paper, {CARD}", "case": f"{name} 1920x1080", "without ms": without}
@@ -129,8 +132,8 @@ def sweep_rows(view: View, repetitions: int, quick: bool, spp: int = SPP) -> lis
         row |= {"bake wall s": wall, "bake cpu s": cpu, "bake samples": bake.counts["samples"]}
         row |= {"cells": len(stage.state.cells), "MB": stage.memory / 1e6}
         row["MB of all cells"] = view.scene_memory(stage) / 1e6
-        times = race({"traced": traced, "field": stage}, repetitions)
-        rows.append(row | _faster(times, "field") | quality(stage, traced))
+        taken = race({"traced": traced, "field": stage}, repetitions, view.device)
+        rows.append(row | _faster(taken, "field") | quality(stage, traced))
     paper = [
         {"table": f"memory: paper, {CARD}", "case": name, "paper MB": kb * 1024e-6} for name, kb in PAPER_KB.items()
     ]

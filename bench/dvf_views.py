@@ -168,6 +168,8 @@ def quality(stage: FieldStage, traced: FieldStage) -> Row:
         wrong = np.rint(np.abs(error) * stage.spp)
     return {
         "RMSE": rmse(stage.picture, traced.picture),
+        "relMSE": gi.metrics.rel_mse(stage.picture, traced.picture),
+        "FLIP": gi.metrics.flip(stage.picture, traced.picture),
         "RMSE white": rmse(error),
         "traced share": traced_share(stage, counts),
         "wrong per million": float(wrong.sum() / total * 1e6),

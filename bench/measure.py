@@ -133,6 +133,13 @@ def ratio_and_spread(name: str, above: Sequence[float], below: Sequence[float]) 
     return median_and_spread(name, np.asarray(above, np.float64) / np.asarray(below, np.float64))
 
 
+def ratios(name: str, above: Taken[Any], below: Taken[Any]) -> Row:
+    """Return ``ratio_and_spread`` of wall, CPU and, on CUDA, device seconds; ``name`` has {} for which of them."""
+    kinds = ("wall", "cpu", "device") if above.device and below.device else ("wall", "cpu")
+    pairs = ((kind, getattr(above, kind), getattr(below, kind)) for kind in kinds)
+    return {k: v for kind, a, b in pairs for k, v in ratio_and_spread(name.format(kind), a, b).items()}
+
+
 # ---- memory ----
 
 

@@ -24,7 +24,7 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi.bench import mitsuba_peer, presets, runner, scatter
-from warp_gi.bench.measure import Row, Taken, peak_memory, ratio_and_spread, take_turns
+from warp_gi.bench.measure import Row, Taken, peak_memory, ratios, take_turns
 
 REPETITIONS, QUICK_REPETITIONS = 6, 3
 SPP = 64
@@ -124,8 +124,7 @@ def rows_of(case: str, size: tuple[int, int], taken: Mapping[str, Taken[np.ndarr
         rows.append(_equal_error_row(case, name, row, ours["relMSE"]))
     for name in (name for name in taken if name != OURS):
         row = {"table": "beside peers", "case": case, "peer": name}
-        for kind in ("wall", "cpu"):
-            row |= ratio_and_spread(f"faster, {kind}", getattr(taken[name], kind), getattr(taken[OURS], kind))
+        row |= ratios("faster, {}", taken[name], taken[OURS])
         row["error ratio"] = ours["relMSE"] / equal_samples[name]["relMSE"]
         for kind in ("wall", "cpu"):
             row[f"faster at equal error, {kind}"] = row[f"faster, {kind}"] / row["error ratio"]

@@ -43,6 +43,8 @@ class Plot:
     log_y: bool = False
     fit: bool = False
     """Fit y = a x^k to each series, draw it dotted and tell k; needs both axes logarithmic."""
+    suite: str = ""
+    """In whose section of the report it stands."""
 
     def validate(self) -> None:
         """Raise OptionError unless x and y of each series have the same length, and axes are logarithmic for a fit."""

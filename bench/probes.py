@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 
 from warp_gi.bench import runner
+from warp_gi.bench.gallery import CLOSED, Gallery, call
 from warp_gi.bench.measure import Row
 from warp_gi.bench.probes_denoise import denoise_rows
 from warp_gi.bench.probes_light import bake_rows, leak_rows, light_rows
@@ -17,9 +18,11 @@ from warp_gi.bench.probes_rays import ray_rows
 PARTS = {"rays": ray_rows, "leaks": leak_rows, "light": light_rows, "bakes": bake_rows, "denoise": denoise_rows}
 
 
-def run(quick: bool = False, device: str = "cpu", parts: list[str] | None = None) -> list[Row]:
+def run(
+    quick: bool = False, device: str = "cpu", parts: list[str] | None = None, gallery: Gallery = CLOSED
+) -> list[Row]:
     """Return rows of all tables; ``quick`` takes fewer rays, pixels and grids."""
-    return [row for part in parts or PARTS for row in PARTS[part](quick, device)]
+    return [row for part in parts or PARTS for row in call(PARTS[part], quick, device, gallery)]
 
 
 def main() -> None:

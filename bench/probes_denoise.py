@@ -9,6 +9,7 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi.bench import presets
+from warp_gi.bench.gallery import CLOSED, Gallery, PictureSet
 from warp_gi.bench.measure import Row
 from warp_gi.errors import OptionError
 
@@ -34,21 +35,28 @@ PIPELINES: dict[str, dict[str, Any]] = {
 }
 
 
-def denoise_rows(quick: bool, device: str) -> list[Row]:
+def denoise_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
     """Return a row for each scene, pipeline and number of rays: the beauty against that of the pipeline's many rays."""
     size, spp = ((240, 135), 64) if quick else ((480, 270), 512)
     rows: list[Row] = []
     for name in list(CASES)[: 1 if quick else None]:
         scene, path = CASES[name]()
         for label, terms in PIPELINES.items():
-            rows += pipeline_rows(name, scene, path.at_resolution(*size), label, terms, spp, device)
+            rows += pipeline_rows(name, scene, path.at_resolution(*size), label, terms, spp, device, gallery)
     return rows
 
 
 def pipeline_rows(
-    name: str, scene: gi.Scene, path: gi.CameraPath, label: str, terms: dict[str, Any], spp: int, device: str
+    name: str,
+    scene: gi.Scene,
+    path: gi.CameraPath,
+    label: str,
+    terms: dict[str, Any],
+    spp: int,
+    device: str,
+    gallery: Gallery = CLOSED,
 ) -> list[Row]:
-    """Return the rows of one scene and pipeline."""
+    """Return the rows of one scene and pipeline; pictures are of the fewest rays."""
     indirect = terms.get("indirect")
     bakes = [gi.bake(scene, indirect, device)] if indirect is not None else []
     many = gi.Pipeline(**terms, spp=spp, camera_samples=1)
@@ -56,6 +64,7 @@ def pipeline_rows(
     rows: list[Row] = []
     for rays in RAYS:
         row: Row = {"table": "denoise", "case": name, "pipeline": label, "rays a pixel": rays}
+        pictures: dict[str, np.ndarray] = {}
         for denoiser, short in DENOISERS.items():
             few = gi.Pipeline(**terms, spp=rays, camera_samples=1, denoise=denoiser)
             try:
@@ -69,9 +78,12 @@ def pipeline_rows(
                 seconds.append(frame.timings["denoise"])
             if "noisy RMSE" not in row:
                 row |= _errors("noisy", frame.numpy("noisy"), truth)
+            pictures |= {"noisy": frame.numpy("noisy"), denoiser: frame.numpy("beauty")}
             row |= _errors(short, frame.numpy("beauty"), truth)
             row[f"{short} ms"] = float(np.median(seconds)) * 1e3
         rows.append(row)
+        if rays == RAYS[0]:
+            gallery.add(PictureSet(f"{name}: denoised {label}, rays a pixel: {rays}", truth, pictures))
     return rows
 
 

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 import warp_gi as gi
-from warp_gi.bench.measure import Row, cost, timed
+from warp_gi.bench.gallery import CLOSED, Gallery, PictureSet
+from warp_gi.bench.measure import Row, ratios, timed
 from warp_gi.bench.probes_views import (
     CORNELL,
     CYLINDERS,
@@ -101,7 +102,7 @@ def _counts(stage: Stage) -> str:
 # ---- modes ----
 
 
-def light_rows(quick: bool, device: str) -> list[Row]:
+def light_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
     """Return errors and times of the modes by place and grid, what the path tracer needs for the same, and table 1."""
     grids: list[tuple[Place, list[dict[str, Any]]]] = [
         (CORNELL, _grids((2, 2, 2), (4, 4, 4), (8, 8, 8))),
@@ -116,7 +117,7 @@ def light_rows(quick: bool, device: str) -> list[Row]:
             rows.append({"table": "indirect light", "case": place.name, "skipped": place.missing})
             continue
         view = view_of(place, (160, 90) if quick else (320, 180), device, 64 if quick else 512)
-        rows += mode_rows(place, view, settings[:1] if quick else settings, 3 if quick else 5)
+        rows += mode_rows(place, view, settings[:1] if quick else settings, 3 if quick else 5, gallery)
     for name, counts, resolution, lambertian, glossy in PAPER_MS:
         row = {"table": f"table 1: paper, {PAPER_CARD}", "case": name, "probes": counts, "resolution": resolution}
         rows.append(row | {"Lambertian ms": lambertian, "glossy ms": glossy})
@@ -127,7 +128,9 @@ def _grids(*counts: tuple[int, int, int]) -> list[dict[str, Any]]:
     return [{"counts": number} for number in counts]
 
 
-def mode_rows(place: Place, view: View, grids: list[dict[str, Any]], repetitions: int) -> list[Row]:
+def mode_rows(
+    place: Place, view: View, grids: list[dict[str, Any]], repetitions: int, gallery: Gallery = CLOSED
+) -> list[Row]:
     """Return rows of one place: of each mode and grid, beside the path tracer at equal time and equal error.
 
     Its error falls with the root of its samples and it takes as long for each of them, so both follow from its noise
@@ -140,21 +143,26 @@ def mode_rows(place: Place, view: View, grids: list[dict[str, Any]], repetitions
         stages: dict[str, Stage] = {"paths": paths}
         for mode in ("irradiance", "hybrid", "traced"):
             stages[mode] = view.stage(1 if mode == "irradiance" else SPP, mode=mode, **settings)
-        times = race(stages, repetitions)
-        each = np.array(times["paths"]) / PATH_SPP
+        taken = race(stages, repetitions, view.device)
+        one_sample = taken["paths"].cost / PATH_SPP
         for mode, stage in stages.items():
             if mode == "paths":
                 continue
-            (wall, cpu), seconds = times[mode], cost(times[mode], view.device)
+            seconds = taken[mode].cost
             quality = view.quality(stage.picture)
             needed = max(noise / max(quality["RMSE"] ** 2, 1e-30), 1.0)
             row: Row = {"table": "indirect light", "case": place.name, "probes": _counts(stage), "mode": mode}
             row |= {"spp": stage.spp} | quality
-            row |= {"ns a pixel": seconds / np.prod(view.camera.resolution) * 1e9, "wall s": wall}
-            row |= {"paths spp for this RMSE": needed, "faster, wall": needed * each[0] / wall}
-            row |= {"faster, cpu": needed * each[1] / cpu, "target": place.target if mode == "irradiance" else 0.0}
-            samples = max(seconds / cost(each, view.device), 1.0)
+            row |= {"ns a pixel": seconds / np.prod(view.camera.resolution) * 1e9} | taken[mode].row()
+            row["paths spp for this RMSE"] = needed
+            ratio = ratios("faster, {}", taken["paths"], taken[mode])
+            row |= {name: value * needed / PATH_SPP for name, value in ratio.items()}
+            row["target"] = place.target if mode == "irradiance" else 0.0
+            samples = max(seconds / one_sample, 1.0)
             rows.append(row | {"paths RMSE in this time": float((noise / samples) ** 0.5)})
+    pictures = {mode: stage.picture for mode, stage in stages.items() if mode != "paths"}
+    case = f"{place.name}: indirect light, {_counts(stages['irradiance'])} probes"
+    gallery.add(PictureSet(case, view.reference, pictures))
     return rows
 
 

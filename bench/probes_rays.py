@@ -11,7 +11,7 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.bench.measure import Row, cost
+from warp_gi.bench.measure import Row, median_and_spread, ratio_and_spread
 from warp_gi.bench.probes_views import CORNELL, LIVING_ROOM, SPONZA, View, view_of
 from warp_gi.bench.stages import Place, race
 from warp_gi.kernels import light_field_march as march_kernels
@@ -100,13 +100,15 @@ def ray_row(
     threads = launch.thread_count()
     try:
         launch.set_threads(1)
-        times = race({"march": lambda: march_rays(state, *rays), "tree": lambda: tree.intersect(*rays)}, repetitions)
+        taken = race(
+            {"march": lambda: march_rays(state, *rays), "tree": lambda: tree.intersect(*rays)}, repetitions, view.device
+        )
     finally:
         launch.set_threads(threads)
-    rates = {name: len(rays[0]) / 1e6 / cost(taken, view.device) for name, taken in times.items()}
+    rates = {name: [len(rays[0]) / 1e6 / seconds for seconds in one.counting] for name, one in taken.items()}
     row: Row = {"table": "rays", "case": place.name, "probes": " x ".join(map(str, counts)), "resolution": resolution}
-    row |= agree | {"Mrays/s": rates["march"], "tree Mrays/s": rates["tree"], "of tree": rates["march"] / rates["tree"]}
-    return row | {"MB": state.nbytes / 1e6}
+    row |= agree | median_and_spread("Mrays/s", rates["march"]) | median_and_spread("tree Mrays/s", rates["tree"])
+    return row | ratio_and_spread("of tree", rates["march"], rates["tree"]) | {"MB": state.nbytes / 1e6}
 
 
 def agreement(hits: dict[str, np.ndarray], is_hit: np.ndarray, t: np.ndarray) -> Row:

@@ -97,7 +97,7 @@ def _plot(choice: Choice, rows: list[Row]) -> Plot:
                 lines.setdefault(_line_name(choice, row, column), []).extend(_points(choice, row, column))
     series = {name: tuple(zip(*sorted(points), strict=True)) for name, points in lines.items() if len(points) > 1}
     y_label = ", ".join(choice.y) if choice.x != FRAME else "MSE / settled MSE"
-    return Plot(choice.title, choice.x, y_label, series, choice.log_x, choice.log_y, choice.fit)
+    return Plot(choice.title, choice.x, y_label, series, choice.log_x, choice.log_y, choice.fit, choice.suite)
 
 
 def _line_name(choice: Choice, row: Row, column: str) -> str:

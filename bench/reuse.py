@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 
 from warp_gi.bench import runner
+from warp_gi.bench.gallery import CLOSED, Gallery, call
 from warp_gi.bench.measure import Row
 from warp_gi.bench.reuse_cost import cost_rows
 from warp_gi.bench.reuse_quality import quality_rows
@@ -24,9 +25,11 @@ PARTS = {
 }
 
 
-def run(quick: bool = False, device: str = "cpu", parts: list[str] | None = None) -> list[Row]:
+def run(
+    quick: bool = False, device: str = "cpu", parts: list[str] | None = None, gallery: Gallery = CLOSED
+) -> list[Row]:
     """Return rows of all tables; ``quick`` takes fewer pixels, frames and scenes."""
-    return [row for part in parts or PARTS for row in PARTS[part](quick, device)]
+    return [row for part in parts or PARTS for row in call(PARTS[part], quick, device, gallery)]
 
 
 def main() -> None:

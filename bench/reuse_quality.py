@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import warp_gi as gi
-from warp_gi.bench.measure import Row
+from warp_gi.bench.gallery import CLOSED, Gallery, PictureSet
+from warp_gi.bench.measure import Row, median_and_spread
 from warp_gi.bench.reuse_views import (
     BISTRO,
     CORNELL,
@@ -64,7 +65,7 @@ def pipelines(**settings: Any) -> dict[str, gi.Pipeline]:
     }
 
 
-def quality_rows(quick: bool, device: str) -> list[Row]:
+def quality_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
     """Return rows of all combinations, of the targets, and what the paper says."""
     spp, frames, settled = (48, 14, 8) if quick else (96, 26, 16)
     rows: list[Row] = []
@@ -73,18 +74,31 @@ def quality_rows(quick: bool, device: str) -> list[Row]:
             rows.append({"table": "combinations", "case": place.name, "skipped": place.missing})
             continue
         size = (120, 68) if quick else LARGE if place.name in {case for case, *_ in TARGETS} else SMALL
-        rows += place_rows(place, size, spp, frames, settled, device)
+        rows += place_rows(place, size, spp, frames, settled, device, gallery)
     rows += target_rows(rows)
     return [*rows, *({"table": "combinations: paper", "case": case, "says": text} for case, text in PAPER)]
 
 
-def place_rows(place: Place, size: tuple[int, int], spp: int, frames: int, settled: int, device: str) -> list[Row]:
+def place_rows(
+    place: Place,
+    size: tuple[int, int],
+    spp: int,
+    frames: int,
+    settled: int,
+    device: str,
+    gallery: Gallery = CLOSED,
+) -> list[Row]:
     """Return a row for each combination: mean errors of the frames from ``settled`` on, and their time."""
     scene, camera = place.scene(), place.camera().at_resolution(*size)
     truth = Truth(scene, camera, device, spp, settings=place.settings)
     runs = run_sequences(scene, camera, pipelines(**place.settings), frames, lambda index: truth, device)
+    pictures = {name: run.frame.numpy("beauty") for name, run in runs.items()}
+    gallery.add(PictureSet(f"{place.name}: frame {frames - 1}", truth.mean("beauty"), pictures))
     base = runs[BASELINE]
-    rows = [combination_row(place.name, name, run, base, settled, device) for name, run in runs.items()]
+    rows = [
+        combination_row(place.name, name, run, base, settled, device) | truth.quality(run.frame)
+        for name, run in runs.items()
+    ]
     return rows + [time_row(place.name, name, run, base, settled, device) for name, run in runs.items()]
 
 
@@ -96,7 +110,8 @@ def slower(run: FrameRun, baseline: FrameRun, first: int, device: str) -> float:
 def combination_row(case: str, name: str, run: FrameRun, baseline: FrameRun, first: int, device: str) -> Row:
     """Return errors of one combination, and beside the baseline's.
 
-    "at equal time" is error times time over the same of the baseline: error falls with the number of samples.
+    "equal time" is error times time over the same of the baseline, as error falls with the number of samples; at equal
+    error the ratio of times is the same, turned over.
     """
     row: Row = {"table": "combinations", "case": case, "combination": name}
     row |= {f"MSE {term}": run.error(term, first) for term in MEASURED}
@@ -104,14 +119,16 @@ def combination_row(case: str, name: str, run: FrameRun, baseline: FrameRun, fir
         row[f"{term} / baseline"] = ratio(run.error(term, first), baseline.error(term, first))
     for term in MEASURED:
         row[f"{term}, equal time"] = slower(run, baseline, first, device) * row[f"{term} / baseline"]
-    return row
+    return row | {"beauty, faster at equal error": 1.0 / max(row["beauty, equal time"], 1e-9)}
 
 
 def time_row(case: str, name: str, run: FrameRun, baseline: FrameRun, first: int, device: str) -> Row:
     """Return wall milliseconds of one combination's frames, and what counts of them beside the baseline's."""
     row: Row = {"table": "combinations: time", "case": case, "combination": name}
     row |= {f"{part} ms": run.milliseconds(part, first) for part in ("preprocess", "paths", "learn")}
-    return row | {"frame ms": run.milliseconds("", first), "time / baseline": slower(run, baseline, first, device)}
+    row |= median_and_spread("frame wall s", [wall for wall, _ in run.times[first:]])
+    row |= median_and_spread("frame cpu s", [cpu for _, cpu in run.times[first:]])
+    return row | {"time / baseline": slower(run, baseline, first, device)}
 
 
 def target_rows(rows: list[Row]) -> list[Row]:

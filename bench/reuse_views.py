@@ -11,7 +11,7 @@ import numpy as np
 import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench import presets
-from warp_gi.bench.measure import Times, cost
+from warp_gi.bench.measure import Row, Times, cost
 from warp_gi.bench.stages import Place
 
 MEASURED = ("emitters", "indirect", "beauty")
@@ -83,6 +83,17 @@ class Truth:
                 frame = scheduler.frame(self.frame)
                 self._halves.append({term: frame.numpy(term).astype(np.float64) for term in MEASURED})
         return self._halves
+
+    def mean(self, term: str) -> np.ndarray:
+        """Return the mean of both halves."""
+        return (self.halves[0][term] + self.halves[1][term]) / 2
+
+    def quality(self, frame: gi.Frame) -> Row:
+        """Return the beauty's relMSE, without the noise of the halves, and FLIP, with it."""
+        picture, mean = frame.numpy("beauty"), self.mean("beauty")
+        a, b = (half["beauty"] for half in self.halves)
+        relative = np.mean((picture - a) * (picture - b) / (mean**2 + gi.metrics.RELATIVE_EPSILON))
+        return {"relMSE beauty": max(float(relative), 0.0), "FLIP beauty": gi.metrics.flip(picture, mean)}
 
     def errors(self, frame: gi.Frame) -> dict[str, float]:
         """Return the mean squared error of each term."""

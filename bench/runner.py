@@ -1,7 +1,8 @@
 """Finds and runs benchmark suites, prints their rows as tables and writes them as lines of JSON.
 
 A suite is a module of this folder with ``run(quick: bool, device: str) -> list[dict]``;
-its first docstring line says what it measures. Rows with the same keys make one table.
+its first docstring line says what it measures. Rows with the same keys make one table. One whose ``run`` also takes
+``gallery`` adds pictures to it. The last row of each is what the whole suite took.
 """
 
 from __future__ import annotations
@@ -12,21 +13,27 @@ import json
 import os
 import platform
 import subprocess
+import time
 import traceback
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from warp_gi import launch
+from warp_gi.bench.gallery import CLOSED, Gallery, call
+from warp_gi.bench.measure import PeakMemory
 from warp_gi.cli_report import print_table
 from warp_gi.errors import unknown_name
 from warp_gi.files import replacing
 
 FOLDER = Path(__file__).parent
-PACKAGES = ("warp-lang", "numpy", "mitsuba", "embreex")
+PACKAGES = ("warp-lang", "numpy", "mitsuba", "embreex", "pyoidn", "OpenImageIO", "bpy")
 ENVIRONMENT = ("quick", "commit", "warp_gi", "python", *PACKAGES, "cpu", "cores", "threads", "device")
 """Keys of a line of results that say how it was measured."""
+WHOLE = "run"
+"""Table of what a whole suite took; CPU seconds, compilation and memory are of this process alone."""
 
 
 def suites(folder: Path = FOLDER) -> dict[str, str]:
@@ -39,15 +46,23 @@ def suites(folder: Path = FOLDER) -> dict[str, str]:
     return found
 
 
-def run_suite(name: str, quick: bool, device: str) -> list[dict[str, Any]]:
-    """Run a suite and return its rows; raises OptionError if there is none of that name or no such device."""
+def run_suite(name: str, quick: bool, device: str, gallery: Gallery = CLOSED) -> list[dict[str, Any]]:
+    """Run a suite and return its rows, the last of them what it took in this process; pictures go to the gallery.
+
+    Raises OptionError if there is no suite of that name or no such device.
+    """
     if name not in (known := suites()):
         raise unknown_name("benchmark suite", name, known)
     launch.get_device(device)
-    return importlib.import_module(f"warp_gi.bench.{name}").run(quick=quick, device=device)
+    run = importlib.import_module(f"warp_gi.bench.{name}").run
+    compiled, memory = launch.compile_seconds, PeakMemory()
+    wall, cpu = time.perf_counter(), time.process_time()
+    rows = call(run, quick, device, gallery.of(name))
+    whole = {"table": WHOLE, "wall s": time.perf_counter() - wall, "cpu s": time.process_time() - cpu}
+    return [*rows, whole | {"compile s": launch.compile_seconds - compiled} | memory.row()]
 
 
-def run_all(quick: bool, device: str) -> Iterator[tuple[str, list[dict[str, Any]], bool]]:
+def run_all(quick: bool, device: str, gallery: Gallery = CLOSED) -> Iterator[tuple[str, list[dict[str, Any]], bool]]:
     """Yield (suite, rows, whether it failed) of every suite in turn; one that fails has a row that says why.
 
     Raises OptionError if there is no such device.
@@ -55,7 +70,7 @@ def run_all(quick: bool, device: str) -> Iterator[tuple[str, list[dict[str, Any]
     launch.get_device(device)
     for name in suites():
         try:
-            rows, failed = run_suite(name, quick, device), False
+            rows, failed = run_suite(name, quick, device, gallery), False
         except Exception as error:  # whatever a suite does, the others go on
             if os.environ.get("WARP_GI_DEBUG", "0") != "0":
                 traceback.print_exc()
@@ -117,12 +132,8 @@ def environment(device: str) -> dict[str, Any]:
 
 def commit() -> str:
     """Return the commit of the working tree, with "+" if it has changes, or "unknown" outside of one."""
-    try:
-        arguments = ["git", "-C", str(FOLDER), "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+"]
-        result = subprocess.run(arguments, capture_output=True, text=True, timeout=20)
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
-    return result.stdout.strip() if result.returncode == 0 else "unknown"
+    arguments = ["git", "-C", str(FOLDER), "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+"]
+    return _printed(arguments) or "unknown"
 
 
 def cpu_model() -> str:
@@ -136,8 +147,24 @@ def cpu_model() -> str:
     return platform.processor() or platform.machine()
 
 
+@lru_cache
 def _version(package: str) -> str | None:
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
+        return _blender_version() if package == "bpy" else None
+
+
+def _blender_version() -> str | None:
+    """Return the version of bpy in the Python that is to run Blender, if it is another."""
+    python = os.environ.get("WARP_GI_BLENDER_PYTHON")
+    return python and _printed([python, "-c", "from importlib import metadata; print(metadata.version('bpy'))"])
+
+
+def _printed(arguments: Sequence[str]) -> str | None:
+    """Return what a program prints, or None if it cannot be run or fails."""
+    try:
+        result = subprocess.run(arguments, capture_output=True, text=True, timeout=20)
+    except (OSError, subprocess.SubprocessError):
         return None
+    return result.stdout.strip() if result.returncode == 0 else None

@@ -11,7 +11,7 @@ import warp as wp
 
 import warp_gi as gi
 from warp_gi.bench import presets
-from warp_gi.bench.measure import Times, take_turns, timed
+from warp_gi.bench.measure import Taken, Times, take_turns, timed
 from warp_gi.pipeline import TERMS
 
 
@@ -68,11 +68,10 @@ def timed_bake(scene: gi.Scene, estimator: Any, device: str, camera: Any = None)
     return timed(lambda: gi.bake(scene, estimator, device, camera_path=camera))
 
 
-def race(stages: Mapping[str, Stage | Callable[[], Any]], repetitions: int, device: str = "cpu") -> dict[str, Times]:
-    """Return the median seconds of each stage, or call; they take turns."""
+def race(stages: Mapping[str, Stage | Callable[[], Any]], repetitions: int, device: str) -> dict[str, Taken[Any]]:
+    """Return what each stage, or call, took; they take turns."""
     works = {name: stage.trace if isinstance(stage, Stage) else stage for name, stage in stages.items()}
-    turns = {name: lambda index, work=work: work() for name, work in works.items()}
-    return {name: taken.times for name, taken in take_turns(turns, repetitions, device).items()}
+    return take_turns({name: lambda index, work=work: work() for name, work in works.items()}, repetitions, device)
 
 
 def rmse(a: np.ndarray, b: np.ndarray | float = 0.0) -> float:

@@ -6,8 +6,23 @@ import numpy as np
 import pytest
 
 import warp_gi as gi
-from warp_gi import cli
-from warp_gi.bench import blender_peer, compile, presets, records, report_plots, runner, sequence
+from warp_gi import cli, launch
+from warp_gi.bench import (
+    blender_peer,
+    compile,
+    diff,
+    measure,
+    presets,
+    probes,
+    rays,
+    records,
+    report_plots,
+    reuse,
+    runner,
+    sequence,
+)
+from warp_gi.bench import gallery as galleries
+from warp_gi.bench.gallery import CLOSED, Gallery, PictureSet
 
 # ---- compile ----
 
@@ -118,14 +133,104 @@ def test_blender_shows_the_same():
     assert abs(row["means differ"]) < 0.03 and row["relMSE of tiles"] < 0.01
 
 
+# ---- pictures ----
+
+
+def test_a_gallery_keeps_means_of_blocks():
+    image = np.random.default_rng(4).uniform(0.01, 30.0, (7, 2 * galleries.WIDEST + 3, 3)).astype(np.float32)
+    broken = image.copy()
+    broken[0, 0], broken[3, 3] = np.nan, np.inf
+    gallery = Gallery()
+    gallery.of("mine").add(PictureSet("case", image, {"broken": broken}))
+    (kept,) = gallery.sets
+    assert (kept.suite, kept.case) == ("mine", "case") and "means of 3 x 3" in kept.note
+    assert kept.reference.shape == (2, image.shape[1] // 3, 3) and kept.reference.dtype == np.float32
+    expected = image[3:6, 6:9].mean(axis=(0, 1))
+    np.testing.assert_allclose(kept.reference[1, 2], expected, rtol=2.0**-6)
+    assert (kept.reference[1, 2] != expected).any()  # rounded, to be small
+    assert np.isnan(kept.images["broken"][0, 0]).all() and np.isinf(kept.images["broken"][1, 1]).all()
+    with pytest.raises(gi.OptionError, match="expected floats"):
+        gallery.add(PictureSet("case", image, {"bad": image[:, :, 0]}))
+
+
+def test_rounding_is_below_the_error_maps_scale():
+    image = np.random.default_rng(5).uniform(1e-3, 100.0, (50, 60, 3)).astype(np.float32)
+    gallery = Gallery()
+    gallery.add(PictureSet("case", None, {"one": image}))
+    (kept,) = gallery.sets
+    assert kept.note == "values kept to 1.6%" and gi.metrics.rel_mse(kept.images["one"], image) < 1e-4
+
+
+def test_a_closed_gallery_keeps_nothing():
+    CLOSED.of("mine").add(PictureSet("case", np.ones((2, 3, 3))))
+    assert CLOSED.sets == []
+
+
+def test_parts_of_suites_get_the_gallery_if_they_take_it(monkeypatch):
+    gallery = Gallery("mine")
+    for suite in (probes, reuse):
+        parts = {"with": lambda quick, device, gallery: [gallery], "without": lambda quick, device: [quick, device]}
+        monkeypatch.setattr(suite, "PARTS", parts)
+        assert suite.run(True, "cpu", gallery=gallery) == [gallery, True, "cpu"]
+        assert suite.run(True, "cpu", ["without"]) == [True, "cpu"]
+
+
+@pytest.mark.parametrize("arguments, is_open", [([], False), (["--html", "r.html"], True)])
+def test_pictures_are_kept_for_a_report_alone(arguments, is_open, tmp_path, monkeypatch, capsys):
+    seen = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(rays, "run", lambda quick, device, gallery: seen.append(gallery) or [{"case": "one"}])
+    assert cli.main(["bench", "rays", *arguments]) == 0
+    assert [(gallery.suite, gallery.is_open) for gallery in seen] == [("rays", is_open)]
+
+
+# ---- what a suite took ----
+
+
+def test_the_last_row_is_of_the_whole_suite(monkeypatch):
+    def run(quick: bool, device: str) -> list[dict]:
+        np.ones(40_000_000)  # 320 MB, for a moment
+        launch.compile_seconds += 2.0
+        return [{"case": "one"}]
+
+    monkeypatch.setattr(launch, "compile_seconds", 7.0)
+    monkeypatch.setattr(rays, "run", run)
+    first, whole = runner.run_suite("rays", True, "cpu")
+    assert first == {"case": "one"} and whole["table"] == "run" and whole["compile s"] == pytest.approx(2.0)
+    assert 0 < whole["cpu s"] and 0 < whole["wall s"] < 60
+    assert whole["peak GB"] > 0.32
+    monkeypatch.setattr(rays, "run", lambda quick, device: [])
+    if measure._forget_peak():  # where the system can: of this run, not of before
+        assert runner.run_suite("rays", True, "cpu")[-1]["peak GB"] < whole["peak GB"] - 0.2
+    assert all(diff.measure_of(column) in (diff.TIME, diff.MEMORY) for column in whole if column != "table")
+
+
+def test_versions_of_peers_are_told(monkeypatch):
+    def version(package: str) -> str:
+        if package == "bpy":
+            raise runner.metadata.PackageNotFoundError
+        return "1.0"
+
+    monkeypatch.setattr(runner.metadata, "version", version)
+    monkeypatch.setenv("WARP_GI_BLENDER_PYTHON", "/nowhere/python")
+    runner._version.cache_clear()
+    found = runner.environment("cpu")
+    assert "bpy" not in found and found["pyoidn"] == found["OpenImageIO"] == "1.0"
+    runner._version.cache_clear()
+    monkeypatch.setattr(runner, "_printed", lambda arguments: f"4.2 of {arguments[0]}")
+    assert runner.environment("cpu")["bpy"] == "4.2 of /nowhere/python"
+    runner._version.cache_clear()
+
+
 # ---- all ----
 
 
 def test_all_goes_on_after_a_suite_that_fails(tmp_path, monkeypatch, capsys):
     asked = []
 
-    def run_suite(name: str, quick: bool, device: str) -> list[dict]:
+    def run_suite(name: str, quick: bool, device: str, gallery: Gallery) -> list[dict]:
         asked.append((name, quick, device))
+        gallery.of(name).add(PictureSet(f"case of {name}", np.ones((2, 3, 3))))
         if name == "bad":
             raise RuntimeError("out of\nluck")
         return [{"case": name, "wall s": 1.5}]
@@ -143,7 +248,8 @@ def test_all_goes_on_after_a_suite_that_fails(tmp_path, monkeypatch, capsys):
         ("last", None, 1.5),
     ]
     text = page.read_text(encoding="utf-8")
-    assert all(f"<h2>{suite}</h2>" in text for suite in ("bad", "first", "last"))
+    for suite, section in zip(("bad", "first", "last"), text.split("<section ")[1:], strict=True):
+        assert f"<h2>{suite}</h2>" in section and f"case of {suite}" in section  # also what was drawn before it failed
     said = capsys.readouterr()
     assert said.err == "failed: bad\n" and str(lines) in said.out
     monkeypatch.setattr(runner, "suites", lambda: {"first": "Measures."})
@@ -152,7 +258,7 @@ def test_all_goes_on_after_a_suite_that_fails(tmp_path, monkeypatch, capsys):
 
 
 def test_all_keeps_what_was_measured_before_an_interrupt(tmp_path, monkeypatch, capsys):
-    def run_suite(name: str, quick: bool, device: str) -> list[dict]:
+    def run_suite(name: str, quick: bool, device: str, gallery: Gallery) -> list[dict]:
         if name == "second":
             raise KeyboardInterrupt
         return [{"case": name}]

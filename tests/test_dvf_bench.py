@@ -7,6 +7,7 @@ import pytest
 
 import warp_gi as gi
 from warp_gi.bench import dvf, dvf_peers, dvf_views, path, presets, stages
+from warp_gi.bench.gallery import Gallery
 
 SIZE = (24, 16)
 
@@ -21,12 +22,18 @@ def view() -> dvf_views.View:
 
 def test_mode_rows_hold_ratios_and_errors(view, monkeypatch):
     monkeypatch.setitem(dvf.PAPER, "samples", 3000)
-    rows = dvf.mode_rows("box", view, 1, 4.0)
+    gallery = Gallery()
+    rows = dvf.mode_rows("box", view, 1, 4.0, gallery)
     assert [row["mode"] for row in rows] == [*dvf.MODES, "paper, its settings"]
     assert len({tuple(row) for row in rows}) == 1  # one table
     for row in rows:
         assert row["ratio wall"] > 0.0 and row["ratio cpu"] > 0.0 and row["target"] == 4.0
         assert 0.0 <= row["RMSE"] < 0.2 and 0.0 < row["traced share"] < 1.0 and row["wrong per million"] >= 0.0
+    (pictures,) = gallery.sets
+    assert list(pictures.images) == [row["mode"] for row in rows]
+    np.testing.assert_allclose(pictures.reference, view.stage(dvf.SPP, mode="traced").picture, rtol=0.02)
+    for row, image in zip(rows, pictures.images.values(), strict=True):
+        assert stages.rmse(image, pictures.reference) == pytest.approx(row["RMSE"], abs=0.01)
 
 
 def test_the_audit_counts_exactly_what_the_pictures_differ_by(view):

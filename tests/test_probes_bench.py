@@ -7,6 +7,7 @@ import pytest
 
 import warp_gi as gi
 from warp_gi.bench import presets, probes, probes_denoise, probes_light, probes_rays, probes_views, stages
+from warp_gi.bench.gallery import Gallery
 
 SMALL = {"resolution": 32, "rays": 1}
 
@@ -50,20 +51,24 @@ def test_agreement_counts_hits_misses_and_the_unknown():
 
 def test_modes_stand_beside_the_path_tracer(view, monkeypatch):
     monkeypatch.setattr(probes_light, "PATH_SPP", 4)
-    rows = probes_light.mode_rows(probes_views.CORNELL, view, [SMALL | {"counts": (2, 2, 2)}], 1)
+    gallery = Gallery()
+    rows = probes_light.mode_rows(probes_views.CORNELL, view, [SMALL | {"counts": (2, 2, 2)}], 1, gallery)
     assert [row["mode"] for row in rows] == ["irradiance", "hybrid", "traced"]
     assert len({tuple(row) for row in rows}) == 1  # one table
     for row in rows:
         assert 0.5 < row["mean / paths"] < 1.5 and row["paths spp for this RMSE"] >= 1 and row["faster, cpu"] > 0
     assert rows[0]["RMSE"] == rows[1]["RMSE"]  # diffuse: "hybrid" has no glossy rays to trace
     assert rows[2]["ns a pixel"] > rows[0]["ns a pixel"]
+    (pictures,) = gallery.sets
+    means = {mode: image.mean() / pictures.reference.mean() for mode, image in pictures.images.items()}
+    assert means == pytest.approx({row["mode"]: row["mean / paths"] for row in rows}, rel=5e-3)
 
 
 def test_a_path_stage_traces_paths(view):
     """Its time would be nothing if it only asked for them."""
     few, many = view.paths(1), view.paths(64)
-    times = stages.race({"few": few, "many": many}, 2)
-    assert times["many"][1] > 5 * times["few"][1]
+    taken = stages.race({"few": few, "many": many}, 2, "cpu")
+    assert taken["many"].cost > 5 * taken["few"].cost
 
 
 def test_leaks_cover_lit_and_dark_and_the_cylinders_cover_probes():
@@ -90,9 +95,14 @@ def test_denoisers_are_compared_with_their_own_pipeline(monkeypatch):
     monkeypatch.setattr(probes_denoise, "RAYS", (1,))
     scene = presets.peer_scene(gi.builtin_scene("cornell_box"), diffuse=True)
     path = gi.builtin_camera_path("cornell_box").at_resolution(32, 24)
-    (row,) = probes_denoise.pipeline_rows("box", scene, path, "paths", {}, 32, "cpu")
+    gallery = Gallery()
+    (row,) = probes_denoise.pipeline_rows("box", scene, path, "paths", {}, 32, "cpu", gallery)
     assert row["ST RMSE"] < 0.7 * row["noisy RMSE"] and row["ST ms"] > 0
     assert "OIDN RMSE" in row or "pyoidn" in row["OIDN skipped"]
+    (pictures,) = gallery.sets
+    for name, image in pictures.images.items():
+        error = row[f"{probes_denoise.DENOISERS.get(name, name)} RMSE"]
+        assert gi.metrics.rmse(image, pictures.reference) == pytest.approx(error, rel=0.05)
 
 
 def test_missing_scenes_give_rows_that_say_so(monkeypatch, tmp_path):

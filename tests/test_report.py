@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
+import os
 import re
 import shutil
+from contextlib import contextmanager
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -13,7 +16,7 @@ import pytest
 
 import warp_gi as gi
 from warp_gi import cli
-from warp_gi.bench import records, report, report_plots
+from warp_gi.bench import records, report, report_plots, report_tables
 from warp_gi.bench.plots import Plot, svg
 from warp_gi.preview import decode_srgb, magma, tone_map
 
@@ -28,6 +31,13 @@ ROWS = [
     {"suite": "speed", **ENVIRONMENT, "table": "times: paper, RTX", "case": "theirs", "seconds": 3.0},
     {"suite": "other", **ENVIRONMENT, "case": "<b>bold</b>", "skipped": "no scene & no </script> either"},
 ]
+SERIES = " ".join(f"{9 / (i + 1):.2f}" for i in range(30))
+LONG = [
+    {"suite": "long", **ENVIRONMENT, "table": "over frames", "frame of a sequence": f"a frame of number {i}"}
+    | {f"column {k}": 1.0 + k for k in range(9)}
+    | {"wall s": w, "wall s spread": 0.05}
+    for i, w in enumerate([9.0, 12345.0, 6.1, *np.arange(20.0, 32.0)])
+] + [{"suite": "long", **ENVIRONMENT, "table": "learning", "case": "a", "MSE by frame": SERIES}]
 
 
 def pictures():
@@ -86,7 +96,7 @@ class Cells(HTMLParser):
 def test_the_file_stands_alone(written):
     text = written.read_text(encoding="utf-8")
     page = Cells(text)
-    assert [value for value in page.loads if not value.startswith("data:")] == []
+    assert [value for value in page.loads if not value.startswith(("data:", "#"))] == []
     assert not re.search(r"url\(|@import|https?://", text)
     assert "link" in page.tags and not page.tags & {"b", "i", "over"}  # the icon is seen; names are escaped
     assert "$" not in re.sub(r"\$\{|<script>.*?</script>", "", text, flags=re.DOTALL)  # no placeholder was left
@@ -129,6 +139,64 @@ def test_what_cannot_be_drawn_leaves_no_file(tmp_path):
     with pytest.raises(gi.OptionError, match="2 x but 1 y"):
         report.write_report(path, "", [], plots=[Plot("p", "", "", {"a": ([1, 2], [1])})])
     assert list(tmp_path.iterdir()) == []
+
+
+def html_of(tmp_path, rows, pictures=(), plots=()):
+    report.write_report(tmp_path / "r.html", "r", rows, pictures, plots)
+    return (tmp_path / "r.html").read_text(encoding="utf-8")
+
+
+def test_spreads_stand_beside_their_values(tmp_path):
+    text = html_of(tmp_path, LONG)
+    (head, *rows), _ = Cells(text).tables
+    assert head[-1] == "wall s" and "spread" not in "".join(head)
+    assert [row[-1] for row in rows[:3]] == ["9.00 ± 0.05", "12,345 ± 0", "6.10 ± 0.05"]
+    assert 'data-value="6.1" title="6.1 ± 0.05"' in text
+    alone = html_of(tmp_path, [{"wall s spread": 0.5, "wall s": 2.0}, {"wall s spread": None, "wall s": 3.0}])
+    assert Cells(alone).tables == [[["wall s"], ["2.0 ± 0.5"], ["3"]]]
+    alone = html_of(tmp_path, [{"wall s": 2.5, "wall s spread": float("nan")}])
+    assert Cells(alone).tables == [[["wall s"], ["2.500"]]]
+    alone = html_of(tmp_path, [{"case": "a", "angle spread": 0.5}])  # a spread of nothing is a column
+    assert Cells(alone).tables == [[["case", "angle spread"], ["a", "0.5000"]]]
+
+
+def test_long_tables_are_folded(tmp_path):
+    text = html_of(tmp_path, LONG)
+    assert text.count("<details") == 1 and "<summary>15 rows</summary>" in text
+    assert "<details" not in html_of(tmp_path, LONG[1:])
+
+
+def test_numbers_in_words_are_drawn(tmp_path):
+    text = html_of(tmp_path, LONG)
+    cell = re.search(r'<td class="series">(.*?)</td>', text)[1]
+    points = [tuple(map(float, point.split(","))) for point in re.search(r'points="([^"]*)"', cell)[1].split()]
+    assert len(points) == 30 and points[0] == (2, 2) and points[-1] == (118, 20)  # from the highest to the lowest
+    assert re.sub(r"<svg.*</svg>", "", cell).split() == ["9", "0.3000"] and SERIES in cell
+    for words in ("1 2 3", "first 1 2 3 4 5 6", "1-2 3-4 5-6 7-8 9-10 11-12", "12"):
+        assert report_tables.series_of(words) is None
+    assert report_tables.series_of(" 1 2e-3 3 4 5 -6 ") == [1, 0.002, 3, 4, 5, -6]
+
+
+def test_a_papers_figures_stand_beside_ours(tmp_path):
+    rows = [{"table": "times", "case": "ours", "s": 1.0}, {"table": "memory", "MB": 2.0}]
+    rows += [{"table": "times: paper, RTX 3080", "case": "theirs", "s": 9.0}]
+    text = html_of(tmp_path, rows)
+    beside = re.search(r'<div class="beside">(.*)', text)[1]
+    assert beside.index("ours") < beside.index("Quoted from the paper (RTX 3080), not measured here.")
+    assert [table[1][0] for table in Cells(text).tables] == ["ours", "theirs", "2"]
+
+
+def test_pictures_and_plots_stand_with_their_suite(tmp_path):
+    shown = [dataclasses.replace(pictures(), suite=suite, note="means of <2>") for suite in ("other", "other", "speed")]
+    text = html_of(tmp_path, ROWS, shown, [plot(suite="speed")])
+    sections = dict(re.findall(r"<section [^>]*><h2>(.*?)</h2>(.*?)</section>", text, re.DOTALL))
+    assert list(sections) == ["speed", "other"]
+    assert [section.count('class="viewer"') for section in sections.values()] == [1, 2]
+    assert [section.count("<figure") for section in sections.values()] == [1, 0]
+    assert sections["other"].count('<details class="case" open>') == 1  # the first
+    assert sections["other"].count(f"{WIDTH} x {HEIGHT} pixels: means of &lt;2&gt;") == 2
+    targets = re.findall(r'<a href="#(.*?)"', text)
+    assert len(targets) == 2 and all(f'<section id="{target}">' in text for target in targets)
 
 
 # ---- plots ----
@@ -211,11 +279,16 @@ def test_report_of_results_files_runs_nothing(tmp_path, capsys, monkeypatch):
 
 
 def test_a_suite_writes_its_report(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("warp_gi.bench.rays.run", lambda quick, device: [{"case": "one", "wall s": 2.0}])
+    def run(quick, device, gallery):
+        gallery.add(report.PictureSet("a room", np.ones((4, 5, 3))))
+        return [{"case": "one", "wall s": 2.0}]
+
+    monkeypatch.setattr("warp_gi.bench.rays.run", run)
     page, lines = tmp_path / "new" / "r.html", tmp_path / "r.jsonl"
     assert cli.main(["bench", "rays", "--quick", "--html", str(page), "--json", str(lines)]) == 0
     text = page.read_text(encoding="utf-8")
-    assert Cells(text).tables == [[["case", "wall s"], ["one", "2"]]] and "quick run, not for quoting" in text
+    assert Cells(text).tables[1] == [["case", "wall s"], ["one", "2"]] and "quick run, not for quoting" in text
+    assert "a room" in text.partition("<h2>rays</h2>")[2] and Cells(text).tables[2][0][:2] == ["wall s", "cpu s"]
     assert records.read([lines])[0]["wall s"] == 2.0
 
 
@@ -230,6 +303,7 @@ BAD = [
     (["--report", "good.jsonl", "--html", "."], "is a folder"),
     (["--report", "good.jsonl", "--html", "good.jsonl/r.html"], "good.jsonl"),
     (["--tolerance", "0.1"], "--tolerance is for --diff"),
+    (["rays", "--quick", "--html", "good.jsonl/r.html"], "good.jsonl"),
     (["--diff", "good.jsonl"], "--diff"),
     (["--diff", "good.jsonl", "none.jsonl"], "none.jsonl: No such file"),
     (["--diff", "good.jsonl", "text.jsonl"], "line 2: not JSON"),
@@ -242,6 +316,7 @@ BAD = [
 @pytest.mark.parametrize("arguments, words", BAD, ids=[" ".join(a) for a, _ in BAD])
 def test_mistakes_are_one_line(arguments, words, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("warp_gi.bench.runner.run_suite", None)  # it is told before anything runs
     texts = {"text": '{"a": 1}\nwords', "list": "[1, 2]", "empty": "\n\n", "good": '{"a": 1}', "other": '{"b": "c"}'}
     for name, text in texts.items():
         Path(f"{name}.jsonl").write_text(text)
@@ -254,12 +329,29 @@ def test_mistakes_are_one_line(arguments, words, tmp_path, monkeypatch, capfd):
 # ---- in a browser ----
 
 
+def missing(reason):
+    """Skip the test, or fail it where WARP_GI_BROWSER says that a browser is required."""
+    (pytest.fail if os.environ.get("WARP_GI_BROWSER") == "required" else pytest.skip)(reason)
+
+
+def test_a_required_browser_is_no_reason_to_skip(monkeypatch):
+    monkeypatch.setenv("WARP_GI_BROWSER", "required")
+    with pytest.raises(pytest.fail.Exception, match="no driver"):
+        missing("no driver")
+    monkeypatch.delenv("WARP_GI_BROWSER")
+    with pytest.raises(pytest.skip.Exception, match="no driver"):
+        missing("no driver")
+
+
 @pytest.fixture(scope="module")
 def browser():
-    driver = pytest.importorskip("playwright.sync_api", reason="no driver: pip install '.[browser]'")
+    try:
+        import playwright.sync_api as driver
+    except ImportError:
+        missing("no driver: pip install '.[browser]'")
     found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if found is None:
-        pytest.skip("no Chromium on the path: apt-get install chromium")
+        missing("no Chromium on the path: apt-get install chromium")
     with driver.sync_playwright() as p:
         started = p.chromium.launch(executable_path=found, args=["--no-sandbox"])
         yield started
@@ -268,16 +360,23 @@ def browser():
 
 @pytest.fixture
 def page(browser, written):
-    """The report at 1280 pixels, offline; at the end nothing must have failed or have been asked of a network."""
-    context = browser.new_context(viewport={"width": 1280, "height": 900}, offline=True)
+    """The report at 1280 pixels."""
+    with opened_page(browser, written) as opened:
+        opened.locator(".viewer").scroll_into_view_if_needed()
+        opened.wait_for_selector(".viewer[data-ready]", timeout=10000)
+        set_exposure(opened, 0)
+        yield opened
+
+
+@contextmanager
+def opened_page(browser, path, width=1280):
+    """A report, offline; at the end nothing must have failed or have been asked of a network."""
+    context = browser.new_context(viewport={"width": width, "height": 900}, offline=True)
     opened, messages, requests = context.new_page(), [], []
     opened.on("console", lambda message: messages.append(message.text))
     opened.on("pageerror", lambda error: messages.append(str(error)))
     opened.on("request", lambda request: requests.append(request.url))
-    opened.goto(written.as_uri())
-    opened.locator(".viewer").scroll_into_view_if_needed()
-    opened.wait_for_selector(".viewer[data-ready]", timeout=10000)
-    set_exposure(opened, 0)
+    opened.goto(path.as_uri())
     yield opened
     assert messages == []
     assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
@@ -446,3 +545,63 @@ def test_wide_tables_scroll_within_themselves(page):
     assert scroller.evaluate("e => e.scrollLeft") == 200
     assert first.bounding_box()["x"] == pytest.approx(scroller.bounding_box()["x"], abs=2)  # it stays in view
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+@pytest.fixture(scope="module")
+def long_report(tmp_path_factory):
+    """A report of several suites: a long and wide table, series, a paper's figures, three sets of pictures."""
+    path = tmp_path_factory.mktemp("long") / "report.html"
+    shown = [
+        dataclasses.replace(pictures(), suite="long", case=f"room {i}, at the middle of a long day") for i in range(3)
+    ]
+    report.write_report(path, "Long", [*LONG, *ROWS], shown, [plot(suite="long")])
+    return path
+
+
+def test_nothing_overflows_a_narrow_page(browser, long_report):
+    with opened_page(browser, long_report, 400) as page:
+        for summary in page.locator("summary").all():
+            if not summary.evaluate("s => s.parentNode.open"):
+                summary.click()
+        page.wait_for_function("document.querySelectorAll('.viewer[data-ready]').length === 3")
+        assert page.evaluate("document.scrollingElement.scrollWidth") <= 400
+        scroller = page.locator(".fold .table")
+        assert scroller.evaluate("e => e.scrollWidth > e.clientWidth && e.getBoundingClientRect().right <= 400")
+        scroller.evaluate("e => { e.scrollLeft = 150 }")
+        first = scroller.locator("tbody th").first.bounding_box()
+        assert first["x"] == pytest.approx(scroller.bounding_box()["x"], abs=2) and 90 < first["width"] < 200
+        outside = "e => !e.closest('.table') && e.getBoundingClientRect().right > 400.5"
+        assert page.evaluate(f"Array.from(document.querySelectorAll('main *')).filter({outside}).length") == 0
+
+
+def test_pictures_are_unpacked_when_they_are_opened(browser, long_report):
+    with opened_page(browser, long_report) as page:
+        page.wait_for_selector(".viewer[data-ready]")
+        ready = "Array.from(document.querySelectorAll('.viewer'), v => 'ready' in v.dataset)"
+        page.wait_for_timeout(200)
+        assert page.evaluate(ready) == [True, False, False]
+        page.locator(".case > summary").nth(1).click()
+        page.wait_for_function(f"{ready}[1]")
+        assert page.evaluate(ready) == [True, True, False]
+
+
+def test_folded_tables_open_and_sort_by_the_value_of_a_spread(browser, long_report):
+    with opened_page(browser, long_report) as page:
+        table = page.locator(".fold table")
+        assert not table.is_visible()
+        page.locator(".fold > summary").click()
+        table.locator("thead button", has_text="wall s").click()
+        shown = table.locator("tbody tr").evaluate_all("rows => rows.map(row => row.cells[10].textContent)")
+        assert shown[:2] == ["6.10 ± 0.05", "9.00 ± 0.05"]
+        assert shown[-1] == "12,345 ± 0"  # as words it would come before 20.00
+
+
+def test_a_papers_table_looks_different(browser, long_report):
+    with opened_page(browser, long_report) as page:
+        look = """e => [getComputedStyle(e).borderTopStyle,
+            getComputedStyle(e.querySelector("tbody th")).backgroundColor]"""
+        both = [page.locator(f".beside .table{kind}") for kind in (":not(.quoted)", ".quoted")]
+        (line, paper), (their_line, their_paper) = (table.evaluate(look) for table in both)
+        assert (line, their_line) == ("solid", "dashed") and paper != their_paper
+        ours, theirs = (table.bounding_box() for table in both)
+        assert theirs["x"] > ours["x"] + ours["width"]  # side by side

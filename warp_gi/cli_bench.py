@@ -7,19 +7,17 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
 from warp_gi import launch
 from warp_gi.bench import diff, records, runner
+from warp_gi.bench.gallery import Gallery, PictureSet
 from warp_gi.cli_options import flag, parse_options
 from warp_gi.cli_report import print_table, start_warp
 from warp_gi.errors import OptionError
 from warp_gi.files import check_writable
-
-if TYPE_CHECKING:
-    from warp_gi.bench.report import PictureSet
 
 ALL = "all"
 
@@ -33,13 +31,13 @@ class Bench:
     """
 
     suite: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SUITE", help_behavior_hint="")] = ""
-    """Name of a module in bench/, or all."""
+    """One that warp-gi bench lists, or all."""
     quick: bool = False
     """Smaller inputs, for a first look; not for figures that anyone quotes."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
     """Also write each row as a line of JSON, with commit, versions, processor and settings; - prints the lines."""
     html: Annotated[Path | None, flag("FILE", "none")] = None
-    """Also write tables and plots as one HTML file that needs no network."""
+    """Also write tables, plots and the pictures that suites compare as one HTML file that needs no network."""
     report: Annotated[tuple[Path, ...], flag("RESULTS...", "none")] = ()
     """Results files that --json wrote, to make the --html report of."""
     diff: Annotated[tuple[Path, Path] | None, flag("OLD NEW", "none")] = None
@@ -90,7 +88,8 @@ def _check(options: Bench) -> None:
 
 def _run(options: Bench) -> None:
     _start(options)
-    rows = runner.run_suite(options.suite, options.quick, options.device)
+    gallery = Gallery(is_open=options.html is not None)
+    rows = runner.run_suite(options.suite, options.quick, options.device, gallery)
     runner.print_rows(options.suite, rows)
     if options.json == Path("-"):
         print(runner.json_lines(options.suite, rows, options.quick, options.device), end="")
@@ -98,14 +97,15 @@ def _run(options: Bench) -> None:
         runner.write_json_lines(options.json, options.suite, rows, options.quick, options.device)
         print(f"rows: {options.json}")
     if options.html is not None:
-        write_html(options.html, runner.stamped(options.suite, rows, options.quick, options.device))
+        stamped = runner.stamped(options.suite, rows, options.quick, options.device)
+        write_html(options.html, stamped, gallery.sets, quiet=options.json == Path("-"))
 
 
 def _run_all(options: Bench) -> int:
     """Run every suite; results are written after each, so that they outlive what comes later. 1 if any failed."""
     _start(options)
-    rows, failed = [], []
-    for suite, found, is_failed in runner.run_all(options.quick, options.device):
+    rows, failed, gallery = [], [], Gallery(is_open=options.html is not None)
+    for suite, found, is_failed in runner.run_all(options.quick, options.device, gallery):
         rows += runner.stamped(suite, found, options.quick, options.device)
         failed += [suite] * is_failed
         runner.print_rows(suite, found)
@@ -116,7 +116,7 @@ def _run_all(options: Bench) -> int:
     if options.json not in (None, Path("-")):
         print(f"rows: {options.json}")
     if options.html is not None:
-        write_html(options.html, rows)
+        write_html(options.html, rows, gallery.sets, quiet=options.json == Path("-"))
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return 1 if failed else 0

@@ -15,7 +15,7 @@ import numpy as np
 from warp_gi import launch
 from warp_gi.baking import Bake
 from warp_gi.bench import compare, compare_reference, compare_rows, compare_setup, records, runner
-from warp_gi.bench.report import PictureSet
+from warp_gi.bench.gallery import PictureSet
 from warp_gi.camera import Camera, CameraPath
 from warp_gi.cli_bench import write_html
 from warp_gi.cli_inputs import DEFAULT_SCENE, SceneOptions, find_camera, find_scene, parse_resolution
@@ -230,6 +230,6 @@ def _pictures(found: compare.Comparison, limit: float) -> list[PictureSet]:
     first = {run.name: run.first.astype(np.float32) for run in found.runs}
     means = {run.name: run.mean.astype(np.float32) for run in found.runs}
     return [
-        PictureSet(f"mean of the frames within {limit:g} s", reference, means),
-        PictureSet("first frame", reference, first),
+        PictureSet(f"mean of the frames within {limit:g} s", reference, means, NAME),
+        PictureSet("first frame", reference, first, NAME),
     ]
