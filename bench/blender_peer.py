@@ -23,6 +23,7 @@ import warp_gi as gi
 from warp_gi import launch, metrics
 from warp_gi.bench import presets
 from warp_gi.bench.measure import Row
+from warp_gi.bench.places import PLACES, WHITE
 from warp_gi.exr import read_exr
 
 PYTHON = os.environ.get("WARP_GI_BLENDER_PYTHON", sys.executable)
@@ -30,7 +31,7 @@ HOW_TO_INSTALL = (
     "no module bpy; install it with: pip install '.[blender]' (or bpy alone), which has wheels for Python 3.11 "
     "(bpy 4.2 to 5.0) and 3.13 (bpy 5.1 and later); WARP_GI_BLENDER_PYTHON names another Python that has it"
 )
-SKY = (1.0, 1.0, 1.0)
+SKY = WHITE
 """W/(m^2 sr)."""
 MAX_DEPTH = 6
 
@@ -40,7 +41,7 @@ class Job:
     """A sequence that both render."""
 
     scene: str
-    """A built-in one, along its camera path."""
+    """Key of a built-in one in `PLACES`, along its camera path."""
     frames: int
     size: tuple[int, int]
     spp: int
@@ -71,8 +72,8 @@ def is_installed() -> bool:
 
 def compare(job: Job, folder: Path) -> Row:
     """Render the sequence by both; raises CalledProcessError if one fails."""
-    scene = presets.peer_scene(gi.builtin_scene(job.scene), diffuse=True, masks=False)
-    path = gi.builtin_camera_path(job.scene).at_resolution(*job.size)
+    scene = presets.peer_scene(PLACES[job.scene].scene(), diffuse=True, masks=False)
+    path = PLACES[job.scene].path().at_resolution(*job.size)
     write_glb(scene, folder / "scene.glb")
     path.save(folder / "camera.json")
     ours = _ours(job, folder)

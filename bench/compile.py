@@ -19,6 +19,7 @@ import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench.compile_cuda import kernel_modules
 from warp_gi.bench.measure import Row
+from warp_gi.bench.places import PLACES
 
 OBJECTS = (".o", ".obj", ".cubin", ".ptx")
 FRAME = "first frame"
@@ -80,8 +81,8 @@ def main(arguments: Sequence[str]) -> None:
     loaded: list[str] = []
     launch.on_load = loaded.append
     if name == FRAME:
-        scene = gi.builtin_scene("cornell_box")
-        next(iter(gi.render(scene, scene.cameras["main"].at_resolution(8, 8), device=device)))
+        box = PLACES["cornell_box"]
+        next(iter(gi.render(box.scene(), box.camera().at_resolution(8, 8), device=device)))
     else:
         kernel_modules()  # a Warp module is known once its file is imported
         launch.load(next(iter(wp.get_module(name).kernels.values())), launch.get_device(device))

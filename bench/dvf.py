@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from warp_gi.bench import dvf_peers, runner
-from warp_gi.bench.dvf_views import PLACES, FieldStage, View, glossy, quality
+from warp_gi.bench.dvf_views import CASES, QUICK_CASES, QUICK_SIZE, SIZE, FieldStage, View, glossy, quality
 from warp_gi.bench.gallery import CLOSED, Gallery, PictureSet
 from warp_gi.bench.measure import Row, Taken, ratios
-from warp_gi.bench.stages import Place, race, rmse
+from warp_gi.bench.stages import Case, race, rmse
 
 SPP = 64
 CARD = "RTX 3080"
@@ -35,21 +35,21 @@ MODES: dict[str, dict[str, Any]] = {
 
 
 def run(quick: bool = False, device: str = "cpu", gallery: Gallery = CLOSED) -> list[Row]:
-    """Return rows of all tables; ``quick`` takes a quarter of the pixels and two values of each setting."""
+    """Return rows of all tables; ``quick`` takes two scenes, coarse fields, few pixels and settings."""
     rows: list[Row] = []
-    for place in PLACES:
+    for place in QUICK_CASES if quick else CASES:
         rows += place_rows(place, quick, device, gallery)
     rows += dvf_peers.equal_error_rows(quick, device)
     rows += dvf_peers.bake_rows(quick, device)
     return rows + dvf_peers.relight_rows(quick, device)
 
 
-def place_rows(place: Place, quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
+def place_rows(place: Case, quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
     """Return what is measured on one scene; the sweeps are Sponza's."""
     if place.missing:
         return [{"table": "modes", "case": place.name, "skipped": place.missing}]
-    camera = place.camera().at_resolution(*((240, 135) if quick else (480, 270)))
-    view, repetitions = View(place.scene(), camera, device, **place.settings), 3 if quick else 7
+    camera = place.camera().at_resolution(*(QUICK_SIZE if quick else SIZE))
+    view, repetitions = View(place.scene(), camera, device, **place.settings), 2 if quick else 7
     rows = mode_rows(place.name, view, repetitions, place.target, gallery)
     if place.name in PAPER_KB:
         rows += sample_count_rows(place.name, view, repetitions, quick)
@@ -117,7 +117,7 @@ def sweep_rows(view: View, repetitions: int, quick: bool, spp: int = SPP) -> lis
     numbers = (80_000, 400_000, 2_000_000, 10_000_000, 0)
     sizes, resolutions = (0.5, 1.0, 2.0, 4.0), (36, 48, 72, 84, 96)
     if quick:
-        numbers, sizes, resolutions = (80_000, 0), (1.0, 4.0), (84,)
+        numbers, sizes, resolutions = (80_000, 0), (2.0,), (48,)
     sweeps: list[tuple[str, str, dict[str, Any]]] = [
         ("samples", f"{number:,}" if number else "automatic", {"samples": number}) for number in numbers
     ]
@@ -143,7 +143,7 @@ def sweep_rows(view: View, repetitions: int, quick: bool, spp: int = SPP) -> lis
 def main() -> None:
     """Print the rows, as tables and as lines of JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a quarter of the pixels, two values of each setting")
+    parser.add_argument("--quick", action="store_true", help="two scenes, coarse fields, few pixels")
     parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
     rows = run(options.quick, options.device)

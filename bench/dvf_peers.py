@@ -17,10 +17,10 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.bench import mitsuba_peer, path, presets, rays, scatter
-from warp_gi.bench.dvf_views import PLACES, WHITE
+from warp_gi.bench import mitsuba_peer, path, places, presets, rays, scatter
+from warp_gi.bench.dvf_views import CASES, QUICK_CASES, QUICK_SIZE, SIZE
 from warp_gi.bench.measure import Row, Taken, peak_memory, take_turns
-from warp_gi.bench.stages import Place, timed_bake
+from warp_gi.bench.stages import LAMBERT, Case, timed_bake
 from warp_gi.bvh import TriangleBvh
 from warp_gi.scene import harmonics
 
@@ -28,7 +28,6 @@ SPP = 64
 RMSE = 0.01
 KINDS = ("wall", "cpu")
 TARGETS = "4 / 2.5 / 1.8"
-EQUAL_ERROR_PLACES = ("Sponza", "atrium", "street", "Bistro")
 OURS: dict[str, Any] = {
     "field, map": gi.VisibilityField(),
     "field, harmonics": gi.VisibilityField(sky="harmonics"),
@@ -38,12 +37,7 @@ MITSUBA = {
     "mitsuba, both": {"type": "direct", "bsdf_samples": 1, "emitter_samples": 1},
     "mitsuba, emitter": {"type": "direct", "bsdf_samples": 0, "emitter_samples": 1},
 }
-_COURTYARD = "environments/courtyard.exr"
-_NAVE = (
-    gi.CameraKey(0.0, (-11.0, 1.5, -0.3), (5.0, 4.0, 0.0)),
-    gi.CameraKey(1.0, (-1.0, 1.8, 0.0), (15.0, 4.0, 0.0)),
-    gi.CameraKey(2.0, (9.0, 2.0, 0.3), (25.0, 4.0, 0.0)),
-)
+FLIGHT = Case("sponza_flight", "Sponza", materials=LAMBERT)
 
 
 # ---- equal error ----
@@ -63,29 +57,34 @@ def smooth_sky(height: int = 64) -> gi.Environment:
 
 def sharp_sky() -> gi.Environment:
     """Return the courtyard, scaled to mean radiance 1."""
-    sky = gi.Environment.load(presets.SCENES / _COURTYARD)
+    sky = gi.Environment.load(presets.SCENES / places.COURTYARD)
     return replace(sky, scale=1.0 / float(sky.mean_radiance.mean()))
 
 
 def equal_error_rows(quick: bool, device: str) -> list[Row]:
     """Return rows of all renderers under a low-frequency sky and an all-frequency one."""
     rows: list[Row] = []
-    size = (240, 135) if quick else (480, 270)
+    size, repetitions = (QUICK_SIZE, path.QUICK_REPETITIONS) if quick else (SIZE, path.REPETITIONS)
     skies: dict[str, Callable[[], gi.Environment]] = {"low-frequency": smooth_sky, "courtyard": sharp_sky}
-    for place in (p for p in PLACES if p.name in EQUAL_ERROR_PLACES[: 1 if quick else None]):
+    for place in [case for case in QUICK_CASES if not case.missing][:1] if quick else CASES:
         for name, sky in skies.items():
-            if place.missing or (name == "courtyard" and not (presets.SCENES / _COURTYARD).exists()):
-                why = place.missing or f"no {presets.SCENES / _COURTYARD}; set WARP_GI_SCENES"
+            if why := place.missing or (places.missing([places.COURTYARD]) if name == "courtyard" else ""):
                 rows.append({"table": "equal error", "case": place.name, "sky": name, "skipped": why})
                 continue
             scene = presets.peer_scene(place.scene(), diffuse=True, masks=False, emission=False)
             scene = gi.Scene(scene.nodes, [], sky(), scene.cameras, scene.name)
-            rows += equal_error(place, scene, name, place.camera().at_resolution(*size), device)
+            rows += equal_error(place, scene, name, place.camera().at_resolution(*size), device, repetitions)
     return rows
 
 
 def equal_error(
-    place: Place, scene: gi.Scene, sky: str, camera: gi.Camera, device: str = "cpu", with_mitsuba: bool = True
+    place: Case,
+    scene: gi.Scene,
+    sky: str,
+    camera: gi.Camera,
+    device: str = "cpu",
+    repetitions: int = path.REPETITIONS,
+    with_mitsuba: bool = True,
 ) -> list[Row]:
     """Return a row for each renderer: seconds of whole frames, scatter, and what an RMSE of 0.01 would take.
 
@@ -104,7 +103,7 @@ def equal_error(
                 renderers[name] = mitsuba_peer.renderer(scene, camera, integrator, SPP)
         except mitsuba_peer.PeerMissing as missing:
             rows.append({"table": "equal error", "case": place.name, "sky": sky, "skipped": str(missing)})
-    taken = take_turns(renderers, path.REPETITIONS, device, keep=path.REPETITIONS, pause=path.PAUSE)
+    taken = take_turns(renderers, repetitions, device, keep=repetitions, pause=path.PAUSE)
     return rows + equal_error_table(place.name, sky, taken)
 
 
@@ -145,10 +144,10 @@ def _ours(scene: gi.Scene, camera: gi.Camera, estimator: Any, device: str) -> Ca
 
 def bake_rows(quick: bool, device: str) -> list[Row]:
     """Return the rate of the bake's rays beside raw any-hit rays, and what a flight through Sponza needs."""
-    place = PLACES[0]
+    place = CASES[0]
     if place.missing:
         return [{"table": "bake rate", "case": place.name, "skipped": place.missing}]
-    size = (240, 135) if quick else (480, 270)
+    size = QUICK_SIZE if quick else SIZE
     rate = bake_rate(
         place.name, place.scene(), place.camera().at_resolution(*size), device, 200_000 if quick else 1_000_000
     )
@@ -190,7 +189,7 @@ def flight_bake(size: tuple[int, int], frames: int, device: str) -> Row:
     """Return seconds, cells, memory and file size of the lazy bake of a flight through Sponza, in its own process."""
     arguments = [sys.executable, "-m", "warp_gi.bench.dvf_peers", "--child", *map(str, (*size, frames)), device]
     done = subprocess.run(arguments, capture_output=True, text=True, check=False)
-    row: Row = {"table": "flight bake", "case": "Sponza", "pixels": f"{size[0]}x{size[1]}", "frames": frames}
+    row: Row = {"table": "flight bake", "case": FLIGHT.name, "pixels": f"{size[0]}x{size[1]}", "frames": frames}
     if done.returncode:
         return row | {"failed": (done.stderr.strip().splitlines() or ["no message"])[-1]}
     return row | json.loads(done.stdout.strip().splitlines()[-1])
@@ -198,7 +197,8 @@ def flight_bake(size: tuple[int, int], frames: int, device: str) -> Row:
 
 def flight(size: tuple[int, int], frames: int) -> gi.CameraPath:
     """Return the path along Sponza's nave in so many frames."""
-    return gi.CameraPath(_NAVE, fps=(frames - 1) / _NAVE[-1].time, resolution=size)
+    nave = FLIGHT.path()
+    return replace(nave, fps=(frames - 1) / nave.keys[-1].time, resolution=size)
 
 
 def _child_main(width: str, height: str, frames: str, device: str) -> None:
@@ -206,7 +206,7 @@ def _child_main(width: str, height: str, frames: str, device: str) -> None:
 
     wp.config.quiet = True
     wp.init()
-    scene = presets.sponza(WHITE)
+    scene = FLIGHT.scene()
     scene.data(device)
     before = peak_memory()
     bake, (wall, cpu) = timed_bake(scene, gi.VisibilityField(), device, flight((int(width), int(height)), int(frames)))
@@ -222,10 +222,10 @@ def _child_main(width: str, height: str, frames: str, device: str) -> None:
 
 def relight_rows(quick: bool, device: str) -> list[Row]:
     """Return seconds of the sky light's stage in Sponza while the sky turns."""
-    place = PLACES[0]
+    place = CASES[0]
     if place.missing:
         return [{"table": "relight", "case": place.name, "skipped": place.missing}]
-    camera = place.camera().at_resolution(*((240, 135) if quick else (480, 270)))
+    camera = place.camera().at_resolution(*(QUICK_SIZE if quick else SIZE))
     return relight(place.name, place.scene(), camera, device, 4 if quick else 8)
 
 

@@ -10,47 +10,23 @@ import warp as wp
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.bench import presets
 from warp_gi.bench.measure import Row, Times
-from warp_gi.bench.stages import Place, Stage, rmse, timed_bake
+from warp_gi.bench.stages import DARK, LAMBERT, Case, Stage, rmse, timed_bake
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_audit as audit_kernels
 from warp_gi.techniques.visibility_state import FieldState
 
-WHITE = (1.0, 1.0, 1.0)
-
-
-def _builtin(name: str) -> gi.Scene:
-    scene = presets.peer_scene(gi.builtin_scene(name), diffuse=True, emission=False)
-    scene.environment = WHITE
-    return scene
-
-
-def _bistro() -> gi.Scene:
-    scene = gi.load_scene(presets.SCENES / "bistro_exterior.glb", environment=WHITE)
-    return presets.peer_scene(scene, diffuse=True, emission=False)
-
-
-PLACES = (
-    Place("Sponza", lambda: presets.sponza(WHITE), lambda: presets.SPONZA_VIEW, 4.0, "crytek_sponza.glb"),
-    Place("atrium", lambda: _builtin("atrium"), lambda: gi.builtin_camera_path("atrium").camera(0), 3.0),
-    Place(
-        "Bistro",
-        _bistro,
-        lambda: gi.Camera.look_at((-40, 45, -60), (-10, 0, -10), hfov=60),
-        2.0,
-        "bistro_exterior.glb",
-        {"cell_size": 1.0},
-    ),
-    Place(
-        "street",
-        lambda: _builtin("street"),
-        lambda: gi.builtin_camera_path("street").camera(0),
-        2.0,
-        "",
-        {"cell_size": 1.0},
-    ),
+CASES = (
+    Case("sponza", target=4.0, materials=LAMBERT),
+    Case("atrium_white", "atrium", 3.0, materials=DARK),
+    Case("bistro_white", "Bistro", 2.0, {"cell_size": 1.0}, DARK),
+    Case("street_white", "street", 2.0, {"cell_size": 1.0}, DARK),
 )
+QUICK_SETTINGS = {"cell_size": 4.0, "resolution": 36}
+"""Of fields that bake in seconds, and save less."""
+QUICK_CASES = tuple(replace(case, settings=QUICK_SETTINGS) for case in (CASES[0], CASES[3]))
+SIZE, QUICK_SIZE = (480, 270), (160, 90)
+"""Of pictures."""
 
 
 def glossy(scene: gi.Scene) -> gi.Scene:

@@ -15,18 +15,20 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 import warp_gi as gi
-from warp_gi.bench import mitsuba_peer, presets, runner, scatter
+from warp_gi.bench import mitsuba_peer, runner, scatter
+from warp_gi.bench.gallery import CLOSED, Gallery, PictureSet
 from warp_gi.bench.measure import Row, Taken, peak_memory, ratios, take_turns
+from warp_gi.bench.places import PLACES
+from warp_gi.bench.stages import DARK, LAMBERT, Case
 
-REPETITIONS, QUICK_REPETITIONS = 6, 3
+REPETITIONS, QUICK_REPETITIONS = 6, 2
 SPP = 64
 PAUSE = 0.2
 """Seconds before a turn, in which the other renderer's threads go to sleep."""
@@ -37,15 +39,12 @@ CAMERA_SAMPLES = 8
 
 
 @dataclass(frozen=True)
-class Case:
-    """A picture that both renderers make."""
+class Picture(Case):
+    """A picture of a place that all renderers make."""
 
-    name: str
-    scene: Callable[[], gi.Scene]
-    camera: gi.Camera
-    max_depth: int
-    files: tuple[str, ...]
-    peer: dict[str, Any]
+    max_depth: int = 2
+    """Edges of the longest path, camera to light: 2 is direct light."""
+    peer: Mapping[str, Any] = field(default_factory=dict)
     """Mitsuba's integrator."""
 
 
@@ -54,32 +53,27 @@ def _path(depth: int) -> dict[str, Any]:
 
 
 _BSDF_ONLY = {"type": "direct", "bsdf_samples": 1, "emitter_samples": 0}
-_SPONZA, _LIVING_ROOM = ("crytek_sponza.glb",), ("living_room/living_room.obj",)
-_COURTYARD = "environments/courtyard.exr"
 
-_white_sponza = partial(presets.sponza, (1.0, 1.0, 1.0))
-_lit_room, _open_room = partial(presets.living_room, lamp=True), partial(presets.living_room, lamp=False)
+_OPAQUE = {**LAMBERT, "masks": False}
+_UNLIT = {**DARK, "masks": False}
 
 CASES = (
-    Case("Sponza, white sky, depth 4", _white_sponza, presets.SPONZA_VIEW, 4, _SPONZA, _path(4)),
-    Case("living room, lamp, depth 4", _lit_room, presets.LIVING_ROOM_VIEW, 4, _LIVING_ROOM, _path(4)),
-    Case("living room, lamp, direct", _lit_room, presets.LIVING_ROOM_VIEW, 2, _LIVING_ROOM, _path(2)),
-    Case("Sponza, white sky, direct", _white_sponza, presets.SPONZA_VIEW, 2, _SPONZA, _BSDF_ONLY),
-    Case("living room, white sky, direct", _open_room, presets.LIVING_ROOM_VIEW, 2, _LIVING_ROOM, _BSDF_ONLY),
-    Case(
-        "Sponza, courtyard sky, direct",
-        partial(presets.sponza, presets.SCENES / _COURTYARD),
-        presets.SPONZA_VIEW,
-        2,
-        (*_SPONZA, _COURTYARD),
-        _path(2),
-    ),
+    Picture("sponza", "Sponza, white sky, depth 4", materials=_OPAQUE, max_depth=4, peer=_path(4)),
+    Picture("living_room", "living room, lamp, depth 4", materials=_OPAQUE, max_depth=4, peer=_path(4)),
+    Picture("living_room", "living room, lamp, direct", materials=_OPAQUE, peer=_path(2)),
+    Picture("sponza", "Sponza, white sky, direct", materials=_OPAQUE, peer=_BSDF_ONLY),
+    Picture("living_room_white", "living room, white sky, direct", materials=_UNLIT, peer=_BSDF_ONLY),
+    Picture("sponza_courtyard", "Sponza, courtyard sky, direct", materials=_OPAQUE, peer=_path(2)),
+    Picture("atrium", "atrium, its sky and lamps, depth 4", materials=_OPAQUE, max_depth=4, peer=_path(4)),
+    Picture("cornell_box", "Cornell box, emitters, direct", materials=_OPAQUE, peer=_path(2)),
 )
+FIRST_FRAMES = {"atrium": "atrium", "crytek_sponza.glb": "sponza"}
+"""Places by their names in rows."""
 
 
-def run(quick: bool = False, device: str = "cpu") -> list[Row]:
-    """Return rows of figures for each case, first frame and memory limit; ``quick`` takes a quarter of the pixels."""
-    rows = [row for case in CASES for row in compare(case, quick, device)]
+def run(quick: bool = False, device: str = "cpu", gallery: Gallery = CLOSED) -> list[Row]:
+    """Return rows of figures for each case, first frame and memory limit; ``quick`` takes a ninth of the pixels."""
+    rows = [row for case in CASES for row in compare(case, quick, device, gallery)]
     return [*rows, *first_frames(device), *bistro_memory(device, quick)]
 
 
@@ -89,14 +83,12 @@ def pipeline(max_depth: int, spp: int) -> gi.Pipeline:
     return gi.Pipeline.preset("path", spp=spp, camera_samples=min(CAMERA_SAMPLES, spp), indirect=indirect)
 
 
-def compare(case: Case, quick: bool, device: str) -> list[Row]:
+def compare(case: Picture, quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
     """Return rows of one case at 64 samples a pixel: each renderer's, at equal time and error, and beside peers."""
-    missing = [name for name in case.files if not (presets.SCENES / name).exists()]
-    if missing:
-        return [{"case": case.name, "skipped": f"no {presets.SCENES / missing[0]}; set WARP_GI_SCENES"}]
-    size, repetitions = ((240, 135), QUICK_REPETITIONS) if quick else ((480, 270), REPETITIONS)
-    camera = case.camera.at_resolution(*size)
-    scene = presets.peer_scene(case.scene(), diffuse=True, masks=False)
+    if case.missing:
+        return [{"case": case.name, "skipped": case.missing}]
+    size, repetitions = ((160, 90), QUICK_REPETITIONS) if quick else ((480, 270), REPETITIONS)
+    scene, camera = case.scene(), case.camera().at_resolution(*size)
     scheduler = gi.FrameScheduler(scene, gi.CameraPath.still(camera), pipeline(case.max_depth, SPP), device)
     renderers = {OURS: lambda index: scheduler.frame(index).numpy("beauty").copy()}
     rows: list[Row] = []
@@ -106,6 +98,9 @@ def compare(case: Case, quick: bool, device: str) -> list[Row]:
         except mitsuba_peer.PeerMissing as missing_peer:
             rows.append({"case": case.name, "skipped": str(missing_peer)})
     taken = take_turns(renderers, repetitions, device, keep=repetitions, pause=PAUSE)
+    pictures = {name: one.results for name, one in taken.items()}
+    shown = {name: group[0] for name, group in pictures.items()}
+    gallery.add(PictureSet(f"{case.name}, {SPP} samples a pixel", scatter.mean_of(pictures).astype(np.float32), shown))
     return rows + rows_of(case.name, size, taken)
 
 
@@ -159,23 +154,23 @@ def _equal_error_row(case: str, name: str, row: Row, target: float) -> Row:
 def first_frames(device: str) -> list[Row]:
     """Return seconds from the start of Python to a finished 480x270 frame at 16 samples, cold and warm kernel cache."""
     rows = []
-    for scene in ("atrium", "crytek_sponza.glb"):
+    for scene, place in FIRST_FRAMES.items():
         with tempfile.TemporaryDirectory() as cache:
             for state in ("cold", "warm"):
-                row = _child(scene, (480, 270), 16, device, cache)
+                row = _child(place, (480, 270), 16, device, cache)
                 rows.append({"table": "first frame", "case": f"first frame of {scene}, {state} kernel cache"} | row)
     return rows
 
 
 def bistro_memory(device: str, quick: bool) -> list[Row]:
     """Return the peak resident memory of rendering the Bistro at 960x540."""
-    row = _child("bistro_exterior.glb", (960, 540), 2 if quick else 16, device, None)
+    row = _child("bistro_wide", (960, 540), 2 if quick else 16, device, None)
     return [{"table": "memory", "case": "Bistro at 960x540"} | row]
 
 
-def _child(scene: str, size: tuple[int, int], spp: int, device: str, cache: str | None) -> Row:
-    if "." in scene and not (presets.SCENES / scene).exists():
-        return {"skipped": f"no {presets.SCENES / scene}"}
+def _child(place: str, size: tuple[int, int], spp: int, device: str, cache: str | None) -> Row:
+    if PLACES[place].missing:
+        return {"skipped": PLACES[place].missing}
     environment = dict(os.environ)
     if cache:
         environment["WARP_CACHE_PATH"] = cache
@@ -185,7 +180,7 @@ def _child(scene: str, size: tuple[int, int], spp: int, device: str, cache: str 
         "-m",
         "warp_gi.bench.path",
         "--child",
-        scene,
+        place,
         str(size[0]),
         str(size[1]),
         str(spp),
@@ -201,23 +196,15 @@ def _child(scene: str, size: tuple[int, int], spp: int, device: str, cache: str 
     return row | result
 
 
-def _child_main(scene: str, width: str, height: str, spp: str, device: str) -> None:
+def _child_main(place: str, width: str, height: str, spp: str, device: str) -> None:
     import warp as wp
 
     wp.config.quiet = True
     wp.init()
     started = time.time()
-    views = {
-        "crytek_sponza.glb": presets.SPONZA_VIEW,
-        "bistro_exterior.glb": gi.Camera.look_at((-40, 45, -60), (-10, 0, -10)),
-    }
-    if "." in scene:
-        loaded = gi.load_scene(presets.SCENES / scene, environment=(1.0, 1.0, 1.0))
-    else:
-        loaded = gi.builtin_scene(scene)
+    loaded = PLACES[place].scene()
     built = time.time()
-    camera = views.get(scene) or next(iter(loaded.cameras.values()))
-    camera = replace(camera, resolution=(int(width), int(height)))
+    camera = PLACES[place].camera().at_resolution(int(width), int(height))
     frame = next(iter(gi.render(loaded, camera, gi.Pipeline.preset("path", spp=int(spp)), device=device)))
     frame.numpy("beauty")
     finished = time.time()
@@ -229,7 +216,7 @@ def _child_main(scene: str, width: str, height: str, spp: str, device: str) -> N
 def main() -> None:
     """Print the rows, as tables and as lines of JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a quarter of the pixels")
+    parser.add_argument("--quick", action="store_true", help="a ninth of the pixels")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--child", nargs=5, help=argparse.SUPPRESS)
     options = parser.parse_args()

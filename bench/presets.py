@@ -1,10 +1,9 @@
-"""The scenes that truth and speed are measured on: one table for the reference script, the tests and the benchmarks."""
+"""Scenes that are measured beside those of files and the built-in ones, and shapes to build them of; see `places`."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,28 +14,7 @@ from warp_gi.scene.builtin import shapes
 SCENES = Path(os.environ.get("WARP_GI_SCENES", Path(__file__).resolve().parents[1] / ".." / "shared" / "scenes"))
 """Folder of the scene files, which are not part of the project."""
 
-SIZE = (72, 40)
-"""Width and height of the reference pictures."""
-
-
-@dataclass(frozen=True)
-class Preset:
-    """A scene as both renderers get it: the materials Mitsuba has an equal for, flat normals, one-sided emission."""
-
-    build: Callable[[], gi.Scene]
-    camera: gi.Camera
-    max_depth: int
-    """Edges of the longest path, camera to light: 2 is direct light."""
-    files: tuple[str, ...] = ()
-    """What has to be in `SCENES`."""
-    peer_error: float = 0.0
-    """Relative standard error of Mitsuba's picture that comes from its ray offset: rays start 9e-5 (1 + |x|) m
-    off a surface at x and look past what is thinner, such as paint. With that offset here the difference is gone."""
-
-    @property
-    def missing(self) -> str:
-        """The files that are not there, or nothing."""
-        return ", ".join(str(SCENES / name) for name in self.files if not (SCENES / name).exists())
+LIVING_ROOM, DRAGON = "living_room/living_room.obj", "stanford_dragon.ply"
 
 
 def peer_scene(
@@ -101,22 +79,15 @@ def light(radiance: tuple[float, float, float]) -> gi.Material:
     return gi.Material("light", (0.0, 0.0, 0.0), specular=0.0, emission=radiance, double_sided=False)
 
 
-def sponza(environment: object) -> gi.Scene:
-    scene = gi.load_scene(SCENES / "crytek_sponza.glb", environment=environment)
-    return peer_scene(scene, diffuse=True)
+def lit_room() -> gi.Scene:
+    """The living room, lit by a square lamp under its ceiling and its own back light."""
+    scene = gi.load_scene(SCENES / LIVING_ROOM)
+    mesh = quad((-0.9, 2.95, 1.6), (0.8, 0.0, 0.0), (0.0, 0.0, 0.8), light((14.0, 11.0, 8.0)), "lamp")
+    return gi.Scene([*scene.nodes, gi.Node("lamp", [mesh])], scene.lights, None, scene.cameras, scene.name)
 
 
-def living_room(lamp: bool, diffuse: bool = True) -> gi.Scene:
-    """The living room, lit by a square lamp under its ceiling and its own back light, or by nothing but a white sky."""
-    scene = gi.load_scene(SCENES / "living_room" / "living_room.obj", environment=None if lamp else (1.0, 1.0, 1.0))
-    if lamp:
-        mesh = quad((-0.9, 2.95, 1.6), (0.8, 0.0, 0.0), (0.0, 0.0, 0.8), light((14.0, 11.0, 8.0)), "lamp")
-        scene = gi.Scene([*scene.nodes, gi.Node("lamp", [mesh])], scene.lights, None, scene.cameras, scene.name)
-    return peer_scene(scene, diffuse=diffuse, emission=lamp)
-
-
-def spheres(environment: object) -> gi.Scene:
-    """Metal spheres of rising roughness before coated ones, on a Lambert floor, below a square lamp and a sky."""
+def spheres() -> gi.Scene:
+    """Metal spheres of rising roughness before coated ones, on a Lambert floor, below a square lamp."""
     meshes = [quad((-6, 0, 6), (12, 0, 0), (0, 0, -12), gi.Material("floor", (0.5, 0.5, 0.5), specular=0.0), "floor")]
     for i, roughness in enumerate((0.1, 0.25, 0.5, 0.75, 1.0)):
         metal = gi.Material(f"metal{i}", (0.95, 0.64, 0.54), metallic=1.0, roughness=roughness)
@@ -126,38 +97,43 @@ def spheres(environment: object) -> gi.Scene:
     mixed = gi.Material("mixed", (0.8, 0.7, 0.2), metallic=0.5, roughness=0.4, specular=0.6)
     meshes.append(quad((-4, 0, -2), (8, 0, 0), (0, 4, -1), mixed, "wall"))
     meshes.append(quad((-1.0, 3.5, 0.0), (2.0, 0, 0), (0, 0, 1.0), light((9.0, 9.0, 9.0)), "lamp"))
-    return peer_scene(gi.Scene([gi.Node("spheres", meshes)], environment=environment, name="spheres"), diffuse=False)
+    return gi.Scene([gi.Node("spheres", meshes)], name="spheres")
 
 
-def _view(eye: object, target: object, hfov: float) -> gi.Camera:
-    return gi.Camera.look_at(eye, target, hfov=hfov, resolution=SIZE)
+# ---- a box with cylinders over probes (light_field_probes.txt, Fig. 10) ----
 
 
-SPONZA_VIEW = _view((-11, 1.5, -0.3), (5, 4, 0), 65.0)
-LIVING_ROOM_VIEW = _view((0, 1, 4), (0.5, 1.2, 0), 60.0)
-SPHERES_VIEW = _view((0, 1.6, 7), (0, 1.1, 0), 50.0)
-_SPONZA, _LIVING_ROOM = "crytek_sponza.glb", "living_room/living_room.obj"
+def cylinder(center: tuple[float, float], radius: float, height: float, material: gi.Material) -> gi.Mesh:
+    """Return an upright cylinder with a lid, standing at (x, z) on y = 0, fronts outward."""
+    sides = 48
+    angle = 2 * np.pi * np.arange(sides) / sides
+    ring = np.stack([center[0] + radius * np.sin(angle), 0 * angle, center[1] + radius * np.cos(angle)], axis=1)
+    upper_ring, middle = ring + np.array([0, height, 0]), [[center[0], height, center[1]]]
+    points = np.concatenate([ring, upper_ring, middle]).astype(np.float32)
+    i, j = np.arange(sides), (np.arange(sides) + 1) % sides
+    lower, upper = np.stack([i, j, i + sides], axis=1), np.stack([j, j + sides, i + sides], axis=1)
+    lid = np.stack([i + sides, j + sides, np.full(sides, 2 * sides)], axis=1)
+    return gi.Mesh(points, np.concatenate([lower, upper, lid]).astype(np.int32), material, name="cylinder")
 
 
-def _cornell() -> gi.Scene:
-    return peer_scene(gi.builtin_scene("cornell_box"), diffuse=True)
+def cylinder_box() -> gi.Scene:
+    """Return a box of 6 x 2 x 6 m, open above, with four cylinders; the one in its middle and two more cover probes.
 
-
-PRESETS: dict[str, Preset] = {
-    "cornell_box": Preset(_cornell, _view((0, 1, 3.4), (0, 1, 0), 55.0), 6),
-    "sponza_white_sky": Preset(lambda: sponza((1.0, 1.0, 1.0)), SPONZA_VIEW, 4, (_SPONZA,)),
-    "sponza_courtyard": Preset(
-        lambda: sponza(SCENES / "environments/courtyard.exr"),
-        SPONZA_VIEW,
-        4,
-        (_SPONZA, "environments/courtyard.exr"),
-    ),
-    "living_room_lamp": Preset(lambda: living_room(lamp=True), LIVING_ROOM_VIEW, 5, (_LIVING_ROOM,), 0.003),
-    "spheres_lamp": Preset(lambda: spheres((0.2, 0.3, 0.5)), SPHERES_VIEW, 5),
-    "spheres_interior": Preset(
-        lambda: spheres(SCENES / "environments/interior.exr"), SPHERES_VIEW, 5, ("environments/interior.exr",)
-    ),
-}
+    Probes are at -2.22, 0 and 2.22 along x and z for a grid of 3 x 2 x 3.
+    """
+    grey = gi.Material("grey", (0.7, 0.7, 0.7), specular=0.0)
+    red, blue = (gi.Material(n, c, specular=0.0) for n, c in (("red", (0.7, 0.2, 0.15)), ("blue", (0.15, 0.25, 0.7))))
+    walls = [
+        quad((-3, 0, 3), (6, 0, 0), (0, 0, -6), grey, "floor"),
+        quad((-3, 0, -3), (6, 0, 0), (0, 2, 0), grey, "back"),
+        quad((3, 0, 3), (-6, 0, 0), (0, 2, 0), grey, "front"),
+        quad((-3, 0, 3), (0, 0, -6), (0, 2, 0), red, "left"),
+        quad((3, 0, -3), (0, 0, 6), (0, 2, 0), blue, "right"),
+    ]
+    places = ((0.0, 0.0, 0.6), (2.2, -2.2, 0.5), (2.2, 0.0, 0.4), (-1.1, 1.2, 0.4))
+    columns = [cylinder((x, z), radius, 1.8, grey) for x, z, radius in places]
+    lamp = quad((-2.5, 1.95, -2.5), (0.8, 0, 0), (0, 0, 0.8), light((20.0, 20.0, 20.0)), "lamp")
+    return gi.Scene([gi.Node("box", [*walls, *columns, lamp])], name="cylinders")
 
 
 # ---- scenes of sample reuse (temporal_reuse.txt, figures 8, 10 and 13b); seen as they are, by gi alone ----
@@ -175,7 +151,7 @@ def covered_dragon() -> gi.Scene:
     """The Stanford dragon, 2 m long, in a room under a grille, above which ten lamps hang."""
     grey = gi.Material("grey", (0.6, 0.6, 0.6), specular=0.0)
     brass = gi.Material("dragon", (0.55, 0.40, 0.22), roughness=0.5)
-    loaded = gi.load_scene(SCENES / "stanford_dragon.ply", scale=10.0)
+    loaded = gi.load_scene(SCENES / DRAGON, scale=10.0)
     low, _ = loaded.bounds
     nodes = []
     for node in loaded.nodes:

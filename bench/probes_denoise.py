@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 import warp_gi as gi
-from warp_gi.bench import presets
 from warp_gi.bench.gallery import CLOSED, Gallery, PictureSet
 from warp_gi.bench.measure import Row
+from warp_gi.bench.stages import LAMBERT, Case
 from warp_gi.errors import OptionError
 
 FRAME = 7
@@ -19,16 +18,7 @@ RAYS = (1, 2, 8)
 DENOISERS = {"spatiotemporal": "ST", "oidn": "OIDN"}
 
 
-def _atrium() -> tuple[gi.Scene, gi.CameraPath]:
-    return gi.builtin_scene("atrium"), gi.builtin_camera_path("atrium")
-
-
-def _cornell() -> tuple[gi.Scene, gi.CameraPath]:
-    scene = presets.peer_scene(gi.builtin_scene("cornell_box"), diffuse=True)
-    return scene, gi.builtin_camera_path("cornell_box")
-
-
-CASES: dict[str, Callable[[], tuple[gi.Scene, gi.CameraPath]]] = {"cornell_box": _cornell, "atrium": _atrium}
+CASES = (Case("cornell_box", "cornell_box", materials=LAMBERT), Case("atrium"))
 PIPELINES: dict[str, dict[str, Any]] = {
     "paths": {},
     "probes, traced": {"indirect": gi.LightFieldProbes(mode="traced", resolution=128)},
@@ -39,10 +29,10 @@ def denoise_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Ro
     """Return a row for each scene, pipeline and number of rays: the beauty against that of the pipeline's many rays."""
     size, spp = ((240, 135), 64) if quick else ((480, 270), 512)
     rows: list[Row] = []
-    for name in list(CASES)[: 1 if quick else None]:
-        scene, path = CASES[name]()
+    for case in CASES[: 1 if quick else None]:
+        scene, path = case.scene(), case.path().at_resolution(*size)
         for label, terms in PIPELINES.items():
-            rows += pipeline_rows(name, scene, path.at_resolution(*size), label, terms, spp, device, gallery)
+            rows += pipeline_rows(case.name, scene, path, label, terms, spp, device, gallery)
     return rows
 
 

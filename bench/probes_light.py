@@ -9,18 +9,17 @@ import numpy as np
 import warp_gi as gi
 from warp_gi.bench.gallery import CLOSED, Gallery, PictureSet
 from warp_gi.bench.measure import Row, ratios, timed
+from warp_gi.bench.places import PLACES
 from warp_gi.bench.probes_views import (
     CORNELL,
-    CYLINDERS,
     GLOSSY_LIVING_ROOM,
     LIVING_ROOM,
     ROOM,
     SPONZA,
     View,
-    cylinder_box,
     view_of,
 )
-from warp_gi.bench.stages import Place, Stage, race
+from warp_gi.bench.stages import Case, Stage, race
 from warp_gi.techniques.light_field_places import lit_data
 
 SPP = 4
@@ -46,8 +45,9 @@ PAPER_BAKE = "60 to 120 s"
 def leak_rows(quick: bool, device: str) -> list[Row]:
     """Return rows of the dark room of two, with and without visibility, and of cylinders over probes."""
     size, spp = ((96, 64), 64) if quick else ((240, 160), 256)
-    scene = gi.builtin_scene("two_rooms")
-    views = {name: View(scene, scene.cameras[name].at_resolution(*size), device, spp) for name in ("lit", "dark")}
+    rooms = {"lit": PLACES["two_rooms"], "dark": PLACES["two_rooms_dark"]}
+    scene = rooms["lit"].scene()
+    views = {name: View(scene, room.camera().at_resolution(*size), device, spp) for name, room in rooms.items()}
     views["dark"].bakes = views["lit"].bakes
     rows: list[Row] = []
     for resolution in (128,) if quick else (128, 256):
@@ -55,7 +55,7 @@ def leak_rows(quick: bool, device: str) -> list[Row]:
             for weights, relocate in (("visibility", True), ("visibility", False), ("trilinear", False)):
                 settings = {"counts": counts, "resolution": resolution, "weights": weights, "relocate": relocate}
                 rows.append(_leak_row(views, settings))
-    view = View(cylinder_box(), CYLINDERS().at_resolution(*size), device, spp)
+    view = view_of(Case("cylinders"), size, device, spp)
     for weights, relocate in (("visibility", True), ("visibility", False), ("trilinear", False)):
         stage = view.stage(1, mode="irradiance", counts=(3, 2, 3), weights=weights, relocate=relocate)
         row: Row = {"table": "cylinders over probes", "weights": weights, "relocate": relocate}
@@ -104,7 +104,7 @@ def _counts(stage: Stage) -> str:
 
 def light_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
     """Return errors and times of the modes by place and grid, what the path tracer needs for the same, and table 1."""
-    grids: list[tuple[Place, list[dict[str, Any]]]] = [
+    grids: list[tuple[Case, list[dict[str, Any]]]] = [
         (CORNELL, _grids((2, 2, 2), (4, 4, 4), (8, 8, 8))),
         (LIVING_ROOM, _grids((4, 4, 4), (8, 4, 8))),
         (ROOM, _grids((4, 4, 4), (8, 4, 8))),
@@ -129,7 +129,7 @@ def _grids(*counts: tuple[int, int, int]) -> list[dict[str, Any]]:
 
 
 def mode_rows(
-    place: Place, view: View, grids: list[dict[str, Any]], repetitions: int, gallery: Gallery = CLOSED
+    place: Case, view: View, grids: list[dict[str, Any]], repetitions: int, gallery: Gallery = CLOSED
 ) -> list[Row]:
     """Return rows of one place: of each mode and grid, beside the path tracer at equal time and equal error.
 
@@ -184,7 +184,7 @@ def bake_rows(quick: bool, device: str) -> list[Row]:
     return [*rows, {"table": f"bakes: paper, {PAPER_CARD}", "all its scenes": PAPER_BAKE}]
 
 
-def bake_row(place: Place, view: View, resolution: int) -> Row:
+def bake_row(place: Case, view: View, resolution: int) -> Row:
     """Return the row of one bake with 4 x 4 x 4 probes."""
     settings = gi.LightFieldProbes(counts=(4, 4, 4), resolution=resolution)
     bake, (wall, cpu) = view.bake(settings)

@@ -13,7 +13,7 @@ import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench.measure import Row, median_and_spread, ratio_and_spread
 from warp_gi.bench.probes_views import CORNELL, LIVING_ROOM, SPONZA, View, view_of
-from warp_gi.bench.stages import Place, race
+from warp_gi.bench.stages import Case, race
 from warp_gi.kernels import light_field_march as march_kernels
 from warp_gi.techniques.light_field_ray import march_rays
 
@@ -37,7 +37,7 @@ def ray_rows(quick: bool, device: str) -> list[Row]:
     return rows
 
 
-def place_rows(place: Place, view: View, quick: bool, count: int = RAYS) -> list[Row]:
+def place_rows(place: Case, view: View, quick: bool, count: int = RAYS) -> list[Row]:
     """Return the rows of one place: the resolution varies with the paper's counts, the counts with its default."""
     (counts, resolution), grids = CASE, []
     for size in (64, 256) if quick else RESOLUTIONS:
@@ -83,7 +83,7 @@ def bounced(
 
 
 def ray_row(
-    place: Place,
+    place: Case,
     view: View,
     rays: tuple[np.ndarray, np.ndarray],
     counts: tuple[int, int, int],

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 import warp_gi as gi
-from warp_gi.bench import presets
 from warp_gi.bench.measure import Row, Times
-from warp_gi.bench.stages import Place, Stage, timed_bake
+from warp_gi.bench.stages import LAMBERT, PLAIN, Case, Stage, timed_bake
 from warp_gi.metrics import RELATIVE_EPSILON
 
 MAX_DEPTH = 16
@@ -20,28 +17,12 @@ MAX_DEPTH = 16
 SEED = 7
 
 
-def _cornell() -> gi.Scene:
-    return presets.peer_scene(gi.builtin_scene("cornell_box"), diffuse=True)
-
-
-CORNELL_VIEW = gi.Camera.look_at((0, 1, 3.4), (0, 1, 0), hfov=55.0)
-_LIVING_ROOM, _SPONZA = "living_room/living_room.obj", "crytek_sponza.glb"
-
-CORNELL = Place("Cornell box", _cornell, lambda: CORNELL_VIEW)
-LIVING_ROOM = Place(
-    "living room", partial(presets.living_room, lamp=True), lambda: presets.LIVING_ROOM_VIEW, 50.0, _LIVING_ROOM
-)
-ROOM_VIEW = gi.Camera.look_at((0, 1.3, 1.2), (0.3, 1.1, 6), hfov=60.0)
-"""The other way, into the living room; `presets.LIVING_ROOM_VIEW` is near its windows."""
-ROOM = Place("living room, all", partial(presets.living_room, lamp=True), lambda: ROOM_VIEW, 50.0, _LIVING_ROOM)
-GLOSSY_LIVING_ROOM = Place(
-    "living room, its materials",
-    partial(presets.living_room, lamp=True, diffuse=False),
-    lambda: ROOM_VIEW,
-    0.0,
-    _LIVING_ROOM,
-)
-SPONZA = Place("Sponza", partial(presets.sponza, (1.0, 1.0, 1.0)), lambda: presets.SPONZA_VIEW, 50.0, _SPONZA)
+CORNELL = Case("cornell_box", materials=LAMBERT)
+LIVING_ROOM = Case("living_room", target=50.0, materials=LAMBERT)
+ROOM = Case("living_room_all", target=50.0, materials=LAMBERT)
+"""The other way, into the living room; `LIVING_ROOM` is near its windows."""
+GLOSSY_LIVING_ROOM = Case("living_room_all", "living room, its materials", materials=PLAIN)
+SPONZA = Case("sponza", target=50.0, materials=LAMBERT)
 
 
 @dataclass
@@ -105,45 +86,6 @@ class View:
         }
 
 
-def view_of(place: Place, size: tuple[int, int], device: str, reference_spp: int) -> View:
+def view_of(place: Case, size: tuple[int, int], device: str, reference_spp: int) -> View:
     """Return the view of a place at a size in pixels."""
     return View(place.scene(), place.camera().at_resolution(*size), device, reference_spp)
-
-
-# ---- a box with cylinders over probes (light_field_probes.txt, Fig. 10) ----
-
-
-def cylinder(center: tuple[float, float], radius: float, height: float, material: gi.Material) -> gi.Mesh:
-    """Return an upright cylinder with a lid, standing at (x, z) on y = 0, fronts outward."""
-    sides = 48
-    angle = 2 * np.pi * np.arange(sides) / sides
-    ring = np.stack([center[0] + radius * np.sin(angle), 0 * angle, center[1] + radius * np.cos(angle)], axis=1)
-    upper_ring, middle = ring + np.array([0, height, 0]), [[center[0], height, center[1]]]
-    points = np.concatenate([ring, upper_ring, middle]).astype(np.float32)
-    i, j = np.arange(sides), (np.arange(sides) + 1) % sides
-    lower, upper = np.stack([i, j, i + sides], axis=1), np.stack([j, j + sides, i + sides], axis=1)
-    lid = np.stack([i + sides, j + sides, np.full(sides, 2 * sides)], axis=1)
-    return gi.Mesh(points, np.concatenate([lower, upper, lid]).astype(np.int32), material, name="cylinder")
-
-
-def cylinder_box() -> gi.Scene:
-    """Return a box of 6 x 2 x 6 m, open above, with four cylinders; the one in its middle and two more cover probes.
-
-    Probes are at -2.22, 0 and 2.22 along x and z for a grid of 3 x 2 x 3.
-    """
-    grey = gi.Material("grey", (0.7, 0.7, 0.7), specular=0.0)
-    red, blue = (gi.Material(n, c, specular=0.0) for n, c in (("red", (0.7, 0.2, 0.15)), ("blue", (0.15, 0.25, 0.7))))
-    walls = [
-        presets.quad((-3, 0, 3), (6, 0, 0), (0, 0, -6), grey, "floor"),
-        presets.quad((-3, 0, -3), (6, 0, 0), (0, 2, 0), grey, "back"),
-        presets.quad((3, 0, 3), (-6, 0, 0), (0, 2, 0), grey, "front"),
-        presets.quad((-3, 0, 3), (0, 0, -6), (0, 2, 0), red, "left"),
-        presets.quad((3, 0, -3), (0, 0, 6), (0, 2, 0), blue, "right"),
-    ]
-    places = ((0.0, 0.0, 0.6), (2.2, -2.2, 0.5), (2.2, 0.0, 0.4), (-1.1, 1.2, 0.4))
-    columns = [cylinder((x, z), radius, 1.8, grey) for x, z, radius in places]
-    lamp = presets.quad((-2.5, 1.95, -2.5), (0.8, 0, 0), (0, 0, 0.8), presets.light((20.0, 20.0, 20.0)), "lamp")
-    return gi.Scene([gi.Node("box", [*walls, *columns, lamp])], name="cylinders")
-
-
-CYLINDERS: Callable[[], gi.Camera] = lambda: gi.Camera.look_at((0, 8.5, 0.01), (0, 0, 0), hfov=42.0)  # noqa: E731

@@ -13,7 +13,6 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,51 +24,45 @@ from warp_gi import bvh as bvh_module
 from warp_gi import launch
 from warp_gi.bench import presets, runner
 from warp_gi.bench.measure import PeakMemory, Row, Taken, median_and_spread, ratio_and_spread, take_turns
+from warp_gi.bench.places import PLACES, Place
 from warp_gi.bvh import TriangleBvh
+from warp_gi.camera import CameraKey
 from warp_gi.errors import unknown_name
 
 T = TypeVar("T")
 REPETITIONS = 5
 RAYS = 1_000_000
 QUICK_RAYS = 200_000
-QUICK_SCENES = ("living room", "sponza")
+QUICK_SCENES = ("living room", "sponza", "atrium")
 NEVER = 1 << 62
 EMBREE = {"embree": False, "embree robust": True}
-
-
-@dataclass(frozen=True)
-class Case:
-    """A scene file and the camera of its primary rays."""
-
-    file: str
-    eye: tuple[float, float, float]
-    target: tuple[float, float, float]
-    hfov: float
-
-
 CASES = {
-    "living room": Case("living_room/living_room.obj", (0.0, 1.0, 4.0), (0.5, 1.2, 0.0), 60.0),
-    "sponza": Case("crytek_sponza.glb", (-11.0, 1.5, -0.3), (5.0, 4.0, 0.0), 65.0),
-    "bistro": Case("bistro_exterior.glb", (-40.0, 45.0, -60.0), (-10.0, 0.0, -10.0), 60.0),
-    "dragon": Case("stanford_dragon.ply", (0.0, 0.15, 0.45), (0.0, 0.12, 0.0), 30.0),
+    "living room": "living_room",
+    "sponza": "sponza",
+    "bistro": "bistro",
+    "dragon": "dragon_white",
+    "atrium": "atrium",
+    "street": "street",
 }
+"""Places by their names in rows; primary rays are those of their cameras."""
 
 
 def run(quick: bool = False, device: str = "cpu", scenes: Sequence[str] | None = None) -> list[Row]:
     """Return a row for each scene's builds and one for each kind of ray and query.
 
-    ``quick`` takes two scenes and fewer rays. Scenes whose file is missing, and peers that are not installed, give
+    ``quick`` takes three scenes and fewer rays. Scenes whose file is missing, and peers that are not installed, give
     a row that says so. Raises OptionError for an unknown scene.
     """
     rows: list[Row] = []
     for name in scenes or (QUICK_SCENES if quick else CASES):
         if name not in CASES:
             raise unknown_name("scene", name, CASES)
-        case = CASES[name]
-        if not (presets.SCENES / case.file).exists():
-            rows.append({"scene": name, "skipped": f"no {presets.SCENES / case.file}; set WARP_GI_SCENES"})
+        place = PLACES[CASES[name]]
+        if place.missing:
+            rows.append({"scene": name, "skipped": place.missing})
             continue
-        points, indices = load_triangles(presets.SCENES / case.file)
+        points, indices = load_triangles(place)
+        case = place.path().keys[0]
         count = QUICK_RAYS if quick else RAYS
         batches = {"diffuse": diffuse_rays(points, indices, count), "primary": primary_rays(case, count)}
         rows += compare(name, points, indices, batches, device, 3 if quick else REPETITIONS)
@@ -248,11 +241,14 @@ def warp_closest(
     faces[i] = wp.where(query.result, query.face, -1)
 
 
-def load_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return float32 [vertex, 3] points and int32 [triangle, 3] indices of a scene file."""
+def load_triangles(place: Place) -> tuple[np.ndarray, np.ndarray]:
+    """Return float32 [vertex, 3] points and int32 [triangle, 3] indices of a place's scene file, or built-in scene."""
     import trimesh
 
-    mesh = trimesh.load(path, force="mesh", process=False)
+    if not place.files:
+        geometry = place.scene().data("cpu").geometry
+        return geometry.points.numpy(), geometry.indices.numpy().reshape(-1, 3)
+    mesh = trimesh.load(presets.SCENES / place.files[0], force="mesh", process=False)
     return np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.int32)
 
 
@@ -273,7 +269,7 @@ def diffuse_rays(points: np.ndarray, indices: np.ndarray, count: int, seed: int 
     return (origins + offset * normal).astype(np.float32), directions.astype(np.float32)
 
 
-def primary_rays(case: Case, count: int) -> tuple[np.ndarray, np.ndarray]:
+def primary_rays(case: CameraKey, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return about ``count`` camera rays through pixel centres of a 3:2 picture, row by row."""
     height = round((count / 1.5) ** 0.5)
     width = height * 3 // 2
@@ -292,7 +288,7 @@ def primary_rays(case: Case, count: int) -> tuple[np.ndarray, np.ndarray]:
 def main() -> None:
     """Print the rows as tables and as lines of JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="two scenes, fewer rays")
+    parser.add_argument("--quick", action="store_true", help="three scenes, fewer rays")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--scenes", nargs="+", choices=list(CASES), help="all by default")
     parser.add_argument("--json", type=Path, help="also write the lines of JSON here")

@@ -9,7 +9,7 @@ import warp as wp
 import warp_gi as gi
 from warp_gi.bench.measure import Row
 from warp_gi.bench.reuse_views import MINE, WAREHOUSE, FrameRun, Truth, run_sequences
-from warp_gi.bench.stages import Place
+from warp_gi.bench.stages import Case
 
 CARD = "RTX 2080 Ti, 1920x1080"
 TARGET_SHARE = 0.08
@@ -54,7 +54,7 @@ def cost_rows(quick: bool, device: str) -> list[Row]:
     return rows
 
 
-def place_cost(place: Place, size: tuple[int, int], frames: int, first: int, device: str) -> list[Row]:
+def place_cost(place: Case, size: tuple[int, int], frames: int, first: int, device: str) -> list[Row]:
     """Return the rows of one place, medians of the frames from ``first`` on."""
     scene, camera = place.scene(), place.camera().at_resolution(*size)
     truth = Truth(scene, camera, device, 1)

@@ -22,7 +22,7 @@ from warp_gi.bench.reuse_views import (
     ratio,
     run_sequences,
 )
-from warp_gi.bench.stages import Place
+from warp_gi.bench.stages import Case
 
 EMITTERS: dict[str, type] = {
     "LightHierarchy": gi.LightHierarchy,
@@ -31,8 +31,8 @@ EMITTERS: dict[str, type] = {
 }
 INDIRECT: dict[str, type] = {"BsdfPaths": gi.BsdfPaths, "GuidedPaths": gi.GuidedPaths}
 BASELINE = "LightHierarchy + BsdfPaths"
-PLACES = (WAREHOUSE, MINE, MINE_ONE_BOUNCE, DRAGON, BISTRO, HALL, CORNELL, SPHERES)
-QUICK_PLACES = (WAREHOUSE, MINE, HALL)
+CASES = (WAREHOUSE, MINE, MINE_ONE_BOUNCE, DRAGON, BISTRO, HALL, CORNELL, SPHERES)
+QUICK_CASES = (WAREHOUSE, MINE, HALL)
 TARGETS = (
     (WAREHOUSE.name, "emitters", "VisibilityLightCache + BsdfPaths", 1 / 8),
     (MINE.name, "indirect", "LightHierarchy + GuidedPaths", 1 / 10),
@@ -69,7 +69,7 @@ def quality_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Ro
     """Return rows of all combinations, of the targets, and what the paper says."""
     spp, frames, settled = (48, 14, 8) if quick else (96, 26, 16)
     rows: list[Row] = []
-    for place in QUICK_PLACES if quick else PLACES:
+    for place in QUICK_CASES if quick else CASES:
         if place.missing:
             rows.append({"table": "combinations", "case": place.name, "skipped": place.missing})
             continue
@@ -80,7 +80,7 @@ def quality_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Ro
 
 
 def place_rows(
-    place: Place,
+    place: Case,
     size: tuple[int, int],
     spp: int,
     frames: int,

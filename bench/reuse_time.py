@@ -23,7 +23,7 @@ from warp_gi.bench.reuse_views import (
     settled_at,
     written,
 )
-from warp_gi.bench.stages import Place
+from warp_gi.bench.stages import Case
 
 LAST = 30
 """Frame up to which adaptation is watched."""
@@ -49,7 +49,7 @@ def adaptation_rows(quick: bool, device: str) -> list[Row]:
     return [*rows, {"table": "adaptation: paper, figure 9", "case": "Quake 2 room", **PAPER_ADAPTATION}]
 
 
-def place_adaptation(place: Place, size: tuple[int, int], spp: int, seeds: int, last: int, device: str) -> list[Row]:
+def place_adaptation(place: Case, size: tuple[int, int], spp: int, seeds: int, last: int, device: str) -> list[Row]:
     """Return a row for the emitters' term with the cache, and one for the indirect term with quadtrees."""
     scene, camera = place.scene(), place.camera().at_resolution(*size)
     truth = Truth(scene, camera, device, spp)

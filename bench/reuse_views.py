@@ -10,9 +10,8 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.bench import presets
 from warp_gi.bench.measure import Row, Times, cost
-from warp_gi.bench.stages import Place
+from warp_gi.bench.stages import Case
 
 MEASURED = ("emitters", "indirect", "beauty")
 SEED = 11
@@ -23,35 +22,17 @@ _NOT_OF_A_FRAME = ("bake", "compile", "scene")
 
 # ---- places ----
 
-
-def _builtin(name: str, camera: str, **settings: object) -> Place:
-    label = name if camera == "main" else f"{name}, {camera}"
-    label += ", one bounce" if settings else ""
-    return Place(
-        label, lambda: gi.builtin_scene(name), lambda: gi.builtin_scene(name).cameras[camera], settings=dict(settings)
-    )
-
-
-def _loaded(name: str, file: str, camera: gi.Camera) -> Place:
-    return Place(name, lambda: gi.load_scene(presets.SCENES / file), lambda: camera, file=file)
-
-
-WAREHOUSE = _builtin("warehouse", "main")
-MINE = _builtin("mine", "spot")
-MINE_ONE_BOUNCE = _builtin("mine", "spot", max_depth=3)
+WAREHOUSE = Case("warehouse")
+MINE = Case("mine_spot")
+MINE_ONE_BOUNCE = Case("mine_spot", "mine, spot, one bounce", settings={"max_depth": 3})
 """All indirect light comes straight from the sun-lit spot, or from what the sky lights around it."""
-DRAGON = Place(
-    "dragon",
-    presets.covered_dragon,
-    lambda: gi.Camera.look_at((0.6, 1.3, 2.7), (0.0, 0.7, 0.0), hfov=60.0),
-    file="stanford_dragon.ply",
-)
-BISTRO = _loaded("Bistro", "bistro_exterior.glb", gi.Camera.look_at((-40, 45, -60), (-10, 0, -10), hfov=60.0))
-HALL = _loaded("modern hall", "modern_hall.glb", gi.Camera.look_at((4, 1.7, 2), (-3, 1.6, -0.5), hfov=60.0))
-CORNELL = _builtin("cornell_box", "main")
-SPHERES = _builtin("sphere_row", "main")
-RING = Place("guiding_ring", presets.guiding_ring, lambda: gi.Camera.look_at((0, 6, 0.01), (0, 0, 0), hfov=26.0))
-STROBE = Place("strobe", presets.strobe, lambda: gi.Camera.look_at((-1.5, 1.6, 2.8), (0.3, 0.9, -1.0), hfov=75.0))
+DRAGON = Case("dragon")
+BISTRO = Case("bistro")
+HALL = Case("modern_hall")
+CORNELL = Case("cornell_box", "cornell_box")
+SPHERES = Case("sphere_row")
+RING = Case("guiding_ring")
+STROBE = Case("strobe")
 
 
 # ---- truth ----

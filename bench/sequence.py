@@ -20,9 +20,10 @@ import numpy as np
 from warp_gi import launch
 from warp_gi.bench import blender_peer
 from warp_gi.bench.measure import Row, median_and_spread, peak_memory
+from warp_gi.bench.places import PLACES
 from warp_gi.cli_report import Reporter, start_warp
 
-SCENE = "atrium"
+SCENE = PLACES["atrium"].source
 CASES: dict[str, tuple[str, ...]] = {
     "path": ("--pipeline", "path"),
     "dvf": ("--pipeline", "dvf", "--environment.cell-size", "1"),

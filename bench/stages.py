@@ -12,27 +12,50 @@ import warp as wp
 import warp_gi as gi
 from warp_gi.bench import presets
 from warp_gi.bench.measure import Taken, Times, take_turns, timed
+from warp_gi.bench.places import PLACES
 from warp_gi.pipeline import TERMS
+
+LAMBERT: Mapping[str, bool] = {"diffuse": True}
+DARK: Mapping[str, bool] = {"diffuse": True, "emission": False}
+PLAIN: Mapping[str, bool] = {"diffuse": False}
+"""Settings of `presets.peer_scene`."""
 
 
 @dataclass(frozen=True)
-class Place:
-    """A scene, and where it is seen from."""
+class Case:
+    """A place as a suite measures it."""
 
-    name: str
-    scene: Callable[[], gi.Scene]
-    camera: Callable[[], gi.Camera]
+    place: str
+    """Key in `PLACES`."""
+    name: str = ""
+    """In rows; the place's title if not given."""
     target: float = 0.0
     """How many times faster than the baseline the estimator shall be."""
-    file: str = ""
-    settings: dict[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
     """Of its estimator, where not the defaults."""
+    materials: Mapping[str, bool] | None = None
+    """What `presets.peer_scene` makes of them; None leaves them as they are."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", self.name or PLACES[self.place].title)
 
     @property
     def missing(self) -> str:
-        """What to say if the scene's file is not there, or nothing."""
-        path = presets.SCENES / self.file
-        return "" if not self.file or path.exists() else f"no {path}; set WARP_GI_SCENES"
+        """What to say if one of the place's files is not there, or nothing."""
+        return PLACES[self.place].missing
+
+    def scene(self) -> gi.Scene:
+        """Return the scene with its materials as they are measured."""
+        scene = PLACES[self.place].scene()
+        return scene if self.materials is None else presets.peer_scene(scene, **self.materials)
+
+    def path(self) -> gi.CameraPath:
+        """Return the place's camera path."""
+        return PLACES[self.place].path()
+
+    def camera(self) -> gi.Camera:
+        """Return the camera of the path's first frame."""
+        return PLACES[self.place].camera()
 
 
 class Stage:

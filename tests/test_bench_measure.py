@@ -11,6 +11,7 @@ import warp as wp
 import warp_gi as gi
 from warp_gi import launch, metrics
 from warp_gi.bench import measure, mitsuba_peer, path, presets, scatter
+from warp_gi.bench.places import PLACES
 
 # ---- time ----
 
@@ -140,7 +141,7 @@ def test_renderers_are_compared_at_equal_samples_time_and_error():
 
 def test_mitsuba_is_the_same_in_both_variants():
     scene = presets.peer_scene(gi.builtin_scene("cornell_box"), diffuse=True)
-    camera = presets.PRESETS["cornell_box"].camera.at_resolution(24, 16)
+    camera = PLACES["cornell_box"].camera().at_resolution(24, 16)
     try:
         renderers = [mitsuba_peer.renderer(scene, camera, path._path(3), 64, variant) for variant in path.VARIANTS]
     except mitsuba_peer.PeerMissing as missing:

@@ -7,6 +7,7 @@ import pytest
 
 import warp_gi as gi
 from warp_gi.bench import presets, rays
+from warp_gi.bench.places import PLACES
 
 
 def test_rows_hold_every_contender_and_all_agree():
@@ -15,7 +16,7 @@ def test_rows_hold_every_contender_and_all_agree():
     points, indices = corners.reshape(-1, 3).astype(np.float32), np.arange(900, dtype=np.int32).reshape(-1, 3)
     batches = {
         "diffuse": rays.diffuse_rays(points, indices, 4000),
-        "primary": rays.primary_rays(rays.Case("", (0.5, 0.5, 3.0), (0.5, 0.5, 0.5), 40.0), 6000),
+        "primary": rays.primary_rays(gi.CameraKey(0.0, (0.5, 0.5, 3.0), (0.5, 0.5, 0.5), hfov=40.0), 6000),
     }
     build, *races = rays.compare("soup", points, indices, batches, repetitions=1)
     assert build["triangles"] == 300 and build["ours build s"] > 0.0 and build["bytes a triangle"] > 0.0
@@ -38,7 +39,7 @@ def test_rays_start_on_the_surface_and_are_unit():
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0, rtol=1e-5)
     assert (origins[:, 2] * directions[:, 2] > 0.0).all()  # on the side they leave to
     assert abs(directions[:, 2]).mean() == pytest.approx(2.0 / 3.0, abs=0.02)  # cosine-distributed
-    origins, directions = rays.primary_rays(rays.CASES["sponza"], 15000)
+    origins, directions = rays.primary_rays(PLACES["sponza"].path().keys[0], 15000)
     assert len(directions) == pytest.approx(15000, rel=0.02)
     width = 150
     assert directions[width * 49 + 74] @ directions[width * 50 + 75] > 0.999
@@ -48,8 +49,12 @@ def test_rays_start_on_the_surface_and_are_unit():
 
 def test_missing_scenes_give_a_row_and_unknown_ones_an_error(monkeypatch, tmp_path):
     monkeypatch.setattr(presets, "SCENES", tmp_path)
+    monkeypatch.setattr(rays, "QUICK_RAYS", 1000)
+    monkeypatch.setitem(rays.CASES, "box", "cornell_box")
+    monkeypatch.setattr(rays, "QUICK_SCENES", ("living room", "sponza", "box"))
     rows = rays.run(quick=True)
-    assert [row["scene"] for row in rows] == list(rays.QUICK_SCENES)
-    assert all("WARP_GI_SCENES" in row["skipped"] for row in rows)
+    assert [row["scene"] for row in rows] == ["living room", "sponza", *["box"] * 5]
+    assert all("WARP_GI_SCENES" in row["skipped"] for row in rows[:2])
+    assert all(row["triangles"] == gi.builtin_scene("cornell_box").triangle_count for row in rows[2:])
     with pytest.raises(gi.OptionError, match="did you mean 'sponza'"):
         rays.run(scenes=["sponsa"])

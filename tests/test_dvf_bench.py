@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import warp_gi as gi
-from warp_gi.bench import dvf, dvf_peers, dvf_views, path, presets, stages
+from warp_gi.bench import dvf, dvf_peers, dvf_views, presets, stages
 from warp_gi.bench.gallery import Gallery
 
 SIZE = (24, 16)
@@ -59,14 +59,13 @@ def test_settings_sample_counts_and_coats_each_make_a_table(view, monkeypatch):
 
 
 def test_equal_error_bake_rate_and_relighting(view, monkeypatch):
-    monkeypatch.setattr(path, "REPETITIONS", 2)
     monkeypatch.setattr(dvf_peers, "SPP", 8)
-    place = stages.Place("box", lambda: view.scene, lambda: view.camera, 1.0, "", {"cell_size": 0.5})
+    place = stages.Case("cornell_box", "box", settings={"cell_size": 0.5})
     sky = dvf_peers.smooth_sky()
     np.testing.assert_allclose(sky.mean_radiance, 1.0, atol=1e-3)
     assert sky.pixels.min() > 0.1
     scene = gi.Scene(view.scene.nodes, [], sky)
-    rows = dvf_peers.equal_error(place, scene, "low-frequency", view.camera, with_mitsuba=False)
+    rows = dvf_peers.equal_error(place, scene, "low-frequency", view.camera, "cpu", 2, with_mitsuba=False)
     assert [row["renderer"] for row in rows] == list(dvf_peers.OURS)
     assert all(0.0 < row["RMSE"] < 1.0 and abs(row["mean / traced"] - 1.0) < 0.1 for row in rows)
     rate = dvf_peers.bake_rate("box", scene, view.camera, "cpu", 2000, view.estimator())
@@ -84,7 +83,11 @@ def test_the_flight_begins_and_ends_in_the_nave():
 
 def test_missing_scenes_give_rows_that_say_so(monkeypatch, tmp_path):
     monkeypatch.setattr(presets, "SCENES", tmp_path)
-    rows = [dvf.place_rows(place, True, "cpu") for place in dvf.PLACES if place.file]
-    rows += [dvf_peers.equal_error_rows(True, "cpu"), dvf_peers.bake_rows(True, "cpu")]
+    missing = tuple(case for case in dvf.CASES if case.missing)
+    assert [case.name for case in missing] == ["Sponza", "Bistro"]
+    monkeypatch.setattr(dvf_peers, "CASES", missing)
+    rows = [dvf.place_rows(place, True, "cpu") for place in missing]
+    rows += [dvf_peers.equal_error_rows(False, "cpu"), dvf_peers.bake_rows(True, "cpu")]
     rows.append(dvf_peers.relight_rows(True, "cpu"))
+    assert len(rows[2]) == 4
     assert all("WARP_GI_SCENES" in row["skipped"] for table in rows for row in table)

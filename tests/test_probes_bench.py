@@ -77,7 +77,7 @@ def test_leaks_cover_lit_and_dark_and_the_cylinders_cover_probes():
     common = SMALL | {"counts": (8, 3, 4), "relocate": False}
     rows = [probes_light._leak_row(views, common | {"weights": weights}) for weights in ("visibility", "trilinear")]
     assert rows[0]["dark / lit"] < 0.1 * rows[1]["dark / lit"]
-    box = probes_views.View(probes_views.cylinder_box(), probes_views.CYLINDERS().at_resolution(32, 32), "cpu", 64)
+    box = probes_views.view_of(stages.Case("cylinders"), (32, 32), "cpu", 64)
     stage = box.stage(1, mode="irradiance", relocate=False, counts=(3, 2, 3), **SMALL)
     assert probes_light.covered(stage) == 6
     row = probes_light.darkened(box, stage)

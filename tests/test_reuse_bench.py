@@ -244,7 +244,7 @@ def test_missing_scenes_give_rows_that_say_so(monkeypatch, tmp_path):
     monkeypatch.setattr(presets, "SCENES", tmp_path)
     places = (reuse_views.DRAGON, reuse_views.BISTRO, reuse_views.HALL)
     assert all("WARP_GI_SCENES" in place.missing for place in places)
-    monkeypatch.setattr(reuse_quality, "PLACES", places)
+    monkeypatch.setattr(reuse_quality, "CASES", places)
     rows = reuse_quality.quality_rows(False, "cpu")
     assert [row["case"] for row in rows if "skipped" in row] == [place.name for place in places]
     assert any("paper" in row["table"] for row in rows)
