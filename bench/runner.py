@@ -15,7 +15,7 @@ import platform
 import subprocess
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -62,20 +62,25 @@ def run_suite(name: str, quick: bool, device: str, gallery: Gallery = CLOSED) ->
     return [*rows, whole | {"compile s": launch.compile_seconds - compiled} | memory.row()]
 
 
-def run_all(quick: bool, device: str, gallery: Gallery = CLOSED) -> Iterator[tuple[str, list[dict[str, Any]], bool]]:
-    """Yield (suite, rows, whether it failed) of every suite in turn; one that fails has a row that says why.
+def run_all(quick: bool, device: str, gallery: Gallery = CLOSED) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """Yield (suite, rows) of every suite in turn; what fails is a row that says why.
 
     Raises OptionError if there is no such device.
     """
     launch.get_device(device)
     for name in suites():
         try:
-            rows, failed = run_suite(name, quick, device, gallery), False
+            rows = run_suite(name, quick, device, gallery)
         except Exception as error:  # whatever a suite does, the others go on
             if os.environ.get("WARP_GI_DEBUG", "0") != "0":
                 traceback.print_exc()
-            rows, failed = [{"failed": f"{type(error).__name__}: {' '.join(str(error).split())}"}], True
-        yield name, rows, failed
+            rows = [{"failed": f"{type(error).__name__}: {' '.join(str(error).split())}"}]
+        yield name, rows
+
+
+def has_failed(rows: Iterable[dict[str, Any]]) -> bool:
+    """Return whether a row says that something failed."""
+    return any("failed" in row for row in rows)
 
 
 def print_rows(title: str, rows: Sequence[dict[str, Any]]) -> None:

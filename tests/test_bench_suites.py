@@ -257,6 +257,16 @@ def test_all_goes_on_after_a_suite_that_fails(tmp_path, monkeypatch, capsys):
     assert [row["suite"] for row in records.read([lines])] == ["first"]
 
 
+def test_a_part_that_failed_is_exit_code_1(monkeypatch, capsys):
+    rows = [{"case": "a", "wall s": 1.0}, {"case": "b", "failed": "no luck"}]
+    monkeypatch.setattr(runner, "suites", lambda: {"one": "Measures."})
+    monkeypatch.setattr(runner, "run_suite", lambda *given: rows)
+    assert [cli.main(["bench", name]) for name in ("one", "all")] == [1, 1]
+    assert capsys.readouterr().err == "failed: one\n" * 2
+    rows.pop()
+    assert [cli.main(["bench", name]) for name in ("one", "all")] == [0, 0]
+
+
 def test_all_keeps_what_was_measured_before_an_interrupt(tmp_path, monkeypatch, capsys):
     def run_suite(name: str, quick: bool, device: str, gallery: Gallery) -> list[dict]:
         if name == "second":

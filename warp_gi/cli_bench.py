@@ -63,7 +63,7 @@ def main(arguments: Sequence[str]) -> int:
     elif options.suite == ALL:
         return _run_all(options)
     elif options.suite:
-        _run(options)
+        return _run(options)
     else:
         others = [(ALL, "Every suite in turn."), ("compare", "Pipelines on a scene of your own; see its --help.")]
         print_table("suites", ("name", "what it measures"), [*sorted(runner.suites().items()), *others])
@@ -86,7 +86,8 @@ def _check(options: Bench) -> None:
             raise OptionError(f"{name} {path}: is a folder; give a file")
 
 
-def _run(options: Bench) -> None:
+def _run(options: Bench) -> int:
+    """Run a suite; 1 if a part of it failed."""
     _start(options)
     gallery = Gallery(is_open=options.html is not None)
     rows = runner.run_suite(options.suite, options.quick, options.device, gallery)
@@ -99,15 +100,23 @@ def _run(options: Bench) -> None:
     if options.html is not None:
         stamped = runner.stamped(options.suite, rows, options.quick, options.device)
         write_html(options.html, stamped, gallery.sets, quiet=options.json == Path("-"))
+    return _told([options.suite] if runner.has_failed(rows) else [])
+
+
+def _told(failed: Sequence[str]) -> int:
+    """Say which suites failed, and return the exit code."""
+    if failed:
+        print(f"failed: {', '.join(failed)}", file=sys.stderr)
+    return 1 if failed else 0
 
 
 def _run_all(options: Bench) -> int:
-    """Run every suite; results are written after each, so that they outlive what comes later. 1 if any failed."""
+    """Run every suite; results are written after each, so that they outlive what comes later. 1 if any part failed."""
     _start(options)
     rows, failed, gallery = [], [], Gallery(is_open=options.html is not None)
-    for suite, found, is_failed in runner.run_all(options.quick, options.device, gallery):
+    for suite, found in runner.run_all(options.quick, options.device, gallery):
         rows += runner.stamped(suite, found, options.quick, options.device)
-        failed += [suite] * is_failed
+        failed += [suite] * runner.has_failed(found)
         runner.print_rows(suite, found)
         if options.json == Path("-"):
             print(runner.json_lines(suite, found, options.quick, options.device), end="")
@@ -117,9 +126,7 @@ def _run_all(options: Bench) -> int:
         print(f"rows: {options.json}")
     if options.html is not None:
         write_html(options.html, rows, gallery.sets, quiet=options.json == Path("-"))
-    if failed:
-        print(f"failed: {', '.join(failed)}", file=sys.stderr)
-    return 1 if failed else 0
+    return _told(failed)
 
 
 def _start(options: Bench) -> None:
