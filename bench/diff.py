@@ -14,7 +14,10 @@ from warp_gi.bench.runner import ENVIRONMENT
 from warp_gi.cli_report import print_table
 from warp_gi.errors import OptionError
 
-SETTINGS = frozenset({"spp", "resolution", "rays a pixel", "degrees", "bits", "migrations", "width", "height", "depth"})
+SETTINGS = frozenset(
+    {"spp", "resolution", "rays a pixel", "degrees", "bits", "migrations", "width", "height", "depth"}
+    | {"triangles", "lights", "Mpixels", "samples", "threads used"}
+)
 """Numbers that say what was measured, as words do, and are no outcome."""
 MACHINE = ("cpu", "cores", "threads", "device")
 """Where these differ, times cannot be compared."""
@@ -43,12 +46,13 @@ ERROR, ACCURACY, MEMORY = Measure(False, 0.05, False), Measure(True, 0.05, False
 
 RULES: tuple[tuple[str, Measure | None], ...] = (
     (r"\bpaper|\b(in|for) this\b", None),
-    (r"faster|speed-?up|^times |(^| )x$|^ratio (wall|cpu)|^(ours|in order) / |/ ours$", RATE),
+    (r"faster|speed-?up|efficiency|^times |(^| )x$|^ratio (wall|cpu)|^(ours|in order) / |/ ours$", RATE),
     (r"^(mitsuba|embree|blender|warp|tree|raw|traced|without)\b", None),  # peers and baselines: not ours to be slower
     (r"/ ?((wall|cpu) )?s$|\ba minute$", RATE),
     (r"\bagree|\bPSNR\b", ACCURACY),
     (r"\bequal time$|\b(time|cost|paths) / baseline$", TIME),
     (r"\bequal samples$|/ baseline$|MSE\b|\bbad pixels\b|\bFLIP\b|\berrors?\b|\bwrong\b|\bbias\b", ERROR),
+    (r"^(exponent|growth)\b", TIME),
     (r"\b(bytes|[KMG]i?B)\b", MEMORY),
     (r"(^|[ (])(ns|us|µs|ms|s|seconds|minutes)($|[ ,)])", TIME),
 )

@@ -98,11 +98,11 @@ def svg(plot: Plot) -> str:
         y_axis = _axis(points[:, 1], HEIGHT - BOTTOM - 6, TOP + 6, plot.log_y)
         parts += _grid(x_axis, y_axis)
         for index, (name, line) in enumerate(lines.items()):
-            exponent = _exponent(line) if plot.fit else None
+            power = exponent(*line.T) if plot.fit else None
             parts += _line(index, name, line, x_axis, y_axis, plot)
-            if exponent is not None:
-                parts.append(_fit_line(index, line, exponent, x_axis, y_axis))
-            legend.append(_legend_entry(index, name, exponent))
+            if power is not None:
+                parts.append(_fit_line(index, line, power, x_axis, y_axis))
+            legend.append(_legend_entry(index, name, power))
     else:
         parts.append(f'<text class="none" x="{WIDTH / 2}" y="{HEIGHT / 2}">no points</text>')
     parts += _frame(plot)
@@ -143,17 +143,17 @@ def _round_step(step: float) -> float:
     return next(m * power for m in (1, 2, 2.5, 5, 10) if m * power >= step * (1 - 1e-9))
 
 
-def _exponent(line: np.ndarray) -> float | None:
+def exponent(x: Sequence[float], y: Sequence[float]) -> float | None:
     """Return k of the power law through the points by least squares of logarithms; None for fewer than two x."""
-    if len(np.unique(line[:, 0])) < 2:
+    if len(np.unique(x)) < 2:
         return None
-    return float(np.polyfit(np.log(line[:, 0]), np.log(line[:, 1]), 1)[0])
+    return float(np.polyfit(np.log(x), np.log(y), 1)[0])
 
 
-def _fit_line(index: int, line: np.ndarray, exponent: float, x_axis: Axis, y_axis: Axis) -> str:
+def _fit_line(index: int, line: np.ndarray, power: float, x_axis: Axis, y_axis: Axis) -> str:
     x = np.array([line[:, 0].min(), line[:, 0].max()])
     middle_x, middle_y = np.exp(np.log(line).mean(axis=0))
-    y = middle_y * (x / middle_x) ** exponent
+    y = middle_y * (x / middle_x) ** power
     (ax, bx), (ay, by) = map(x_axis.place, x), map(y_axis.place, y)
     return f'<line class="fit s{index % STYLES}" x1="{ax:.1f}" y1="{ay:.1f}" x2="{bx:.1f}" y2="{by:.1f}"/>'
 
@@ -173,9 +173,9 @@ def _line(index: int, name: str, line: np.ndarray, x_axis: Axis, y_axis: Axis, p
     return parts
 
 
-def _legend_entry(index: int, name: str, exponent: float | None) -> str:
+def _legend_entry(index: int, name: str, power: float | None) -> str:
     style, dash, marker = f"s{index % STYLES}", DASHES[index % len(DASHES)], MARKERS[index % len(MARKERS)]
-    fitted = "" if exponent is None else f' <span class="exponent">∝ x<sup>{exponent:.2f}</sup></span>'
+    fitted = "" if power is None else f' <span class="exponent">∝ x<sup>{power:.2f}</sup></span>'
     return (
         f'<li><svg viewBox="0 0 36 12" width="36" height="12" aria-hidden="true">'
         f'<polyline class="line {style}" stroke-dasharray="{dash}" points="1,6 35,6"/>'

@@ -33,6 +33,28 @@ class Choice:
 
 _BY_FRAME = ("MSE / settled by frame",)
 
+
+def _power_law(table: str, title: str, x: str, y: tuple[str, ...], by: tuple[str, ...] = ()) -> Choice:
+    """Return a plot of the suite ``scaling``."""
+    return Choice("scaling", table, title, x, y, by, log_x=True, log_y=True, fit=True)
+
+
+SCALING = (
+    _power_law("triangles: rays", "Time a ray over triangles", "triangles", ("ours ns a ray",), ("rays", "query")),
+    _power_law("triangles: rays", "Embree's time a ray", "triangles", ("embree ns a ray",), ("rays", "query")),
+    _power_law("triangles", "Building over triangles", "triangles", ("build cpu s", "embree build cpu s")),
+    _power_law("triangles", "Bytes a triangle of the tree", "triangles", ("bytes a triangle",)),
+    _power_law("triangles", "Memory that building takes at most", "triangles", ("build peak GB",)),
+    _power_law("lights", "Seconds a frame over lights", "lights", ("frame cpu s",), ("estimator",)),
+    _power_law("lights", "Preparation over lights", "lights", ("start s",), ("estimator",)),
+    _power_law("pixels", "Seconds a frame over pixels", "Mpixels", ("frame cpu s",), ("pipeline",)),
+    _power_law("pixels", "Peak memory over pixels", "Mpixels", ("peak GB",), ("pipeline",)),
+    _power_law("bake samples", "Baking over surface samples", "samples", ("bake cpu s",)),
+    _power_law("bake samples", "Error over surface samples", "samples", ("RMSE", "RMSE white")),
+    _power_law("probes", "Baking over texels a side of a probe", "resolution", ("bake cpu s",)),
+    _power_law("threads", "Speed-up over threads", "threads used", ("speed-up",), ("work",)),
+)
+
 PLOTS = (
     Choice("compare", "error over time", "Error over render time", "render s", ("RMSE",), ("pipeline",), True, True),
     Choice("compare", "error over time", "Error over frames", "frames", ("RMSE",), ("pipeline",), True, True),
@@ -47,10 +69,21 @@ PLOTS = (
         True,
     ),
     Choice("sequence", "memory over frames", "Memory over frames", "frame number", ("MB",), ("pipeline",)),
-    Choice("rays", "", "Rays a second over triangles", "triangles", ("ours Mrays/s",), ("rays", "query"), True, True),
     Choice(
-        "rays", "", "Building over triangles", "triangles", ("ours build s", "embree build s"), (), True, True, True
+        "rays", "rays", "Rays a second over triangles", "triangles", ("ours Mrays/s",), ("rays", "query"), True, True
     ),
+    Choice(
+        "rays",
+        "builds",
+        "Building over triangles",
+        "triangles",
+        ("ours build s", "embree build s"),
+        (),
+        True,
+        True,
+        True,
+    ),
+    *SCALING,
     Choice("dvf", "table 1", "Speed-up over samples a pixel", "spp", ("ratio cpu",), ("case",), True),
     Choice("dvf", "table 1", "Error over samples a pixel", "spp", ("RMSE",), ("case",), True, True, True),
     Choice("probes", "rays", "Rays that agree over texels a side", "resolution", ("agree",), ("case", "probes"), True),
@@ -102,7 +135,7 @@ def _plot(choice: Choice, rows: list[Row]) -> Plot:
 
 def _line_name(choice: Choice, row: Row, column: str) -> str:
     said = [value if isinstance(value := row.get(key, ""), str) else f"{key} {value:g}" for key in choice.by]
-    return ", ".join([*said, column] if len(choice.y) > 1 else said)
+    return ", ".join([*said, column] if len(choice.y) > 1 or not said else said)
 
 
 def _points(choice: Choice, row: Row, column: str) -> list[tuple[float, float]]:

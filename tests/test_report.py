@@ -245,7 +245,7 @@ def test_series_differ_without_their_colours():
 
 def test_plots_of_rows():
     rows = [
-        {"scene": s, "triangles": t, "rays": "diffuse", "query": q, "ours Mrays/s": 10.0 / t}
+        {"table": "rays", "scene": s, "triangles": t, "rays": "diffuse", "query": q, "ours Mrays/s": 10.0 / t}
         for s, t in (("big", 1000), ("small", 10))
         for q in ("any", "closest")
     ]
@@ -270,7 +270,7 @@ def write_lines(path, rows):
 
 def test_report_of_results_files_runs_nothing(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("warp_gi.bench.runner.run_suite", None)
-    rows = [{"triangles": t, "rays": "diffuse", "query": "any", "ours Mrays/s": 1.0} for t in (10, 20)]
+    rows = [{"table": "rays", "triangles": t, "rays": "diffuse", "query": "any", "ours Mrays/s": 1.0} for t in (10, 20)]
     files = [str(write_lines(tmp_path / name, rows)) for name in ("a.jsonl", "b.jsonl")]
     assert cli.main(["bench", "--report", *files, "--html", str(tmp_path / "r.html")]) == 0
     assert "r.html" in capsys.readouterr().out
