@@ -28,8 +28,9 @@ from warp_gi.bench.measure import Row, Taken, peak_memory, ratios, take_turns
 from warp_gi.bench.places import PLACES
 from warp_gi.bench.stages import DARK, LAMBERT, Case
 
-REPETITIONS, QUICK_REPETITIONS = 6, 2
-SPP = 64
+REPETITIONS, QUICK_REPETITIONS = 5, 2
+SPP, QUICK_SPP = 64, 16
+SIZE, QUICK_SIZE = (320, 180), (160, 90)
 PAUSE = 0.2
 """Seconds before a turn, in which the other renderer's threads go to sleep."""
 OURS = "ours"
@@ -67,14 +68,16 @@ CASES = (
     Picture("atrium", "atrium, its sky and lamps, depth 4", materials=_OPAQUE, max_depth=4, peer=_path(4)),
     Picture("cornell_box", "Cornell box, emitters, direct", materials=_OPAQUE, peer=_path(2)),
 )
+QUICK_CASES = (CASES[0], CASES[2], CASES[5], CASES[7])
 FIRST_FRAMES = {"atrium": "atrium", "crytek_sponza.glb": "sponza"}
 """Places by their names in rows."""
 
 
 def run(quick: bool = False, device: str = "cpu", gallery: Gallery = CLOSED) -> list[Row]:
-    """Return rows of figures for each case, first frame and memory limit; ``quick`` takes a ninth of the pixels."""
-    rows = [row for case in CASES for row in compare(case, quick, device, gallery)]
-    return [*rows, *first_frames(device), *bistro_memory(device, quick)]
+    """Return rows of figures for each case, first frame and memory limit; ``quick`` takes half of them, smaller."""
+    cases = QUICK_CASES if quick else CASES
+    rows = [row for case in cases for row in compare(case, quick, device, gallery)]
+    return [*rows, *first_frames(device, quick), *bistro_memory(device, quick)]
 
 
 def pipeline(max_depth: int, spp: int) -> gi.Pipeline:
@@ -84,30 +87,30 @@ def pipeline(max_depth: int, spp: int) -> gi.Pipeline:
 
 
 def compare(case: Picture, quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
-    """Return rows of one case at 64 samples a pixel: each renderer's, at equal time and error, and beside peers."""
+    """Return rows of one case at equal samples: each renderer's, at equal time and error, and beside peers."""
     if case.missing:
         return [{"case": case.name, "skipped": case.missing}]
-    size, repetitions = ((160, 90), QUICK_REPETITIONS) if quick else ((480, 270), REPETITIONS)
+    size, spp, repetitions = (QUICK_SIZE, QUICK_SPP, QUICK_REPETITIONS) if quick else (SIZE, SPP, REPETITIONS)
     scene, camera = case.scene(), case.camera().at_resolution(*size)
-    scheduler = gi.FrameScheduler(scene, gi.CameraPath.still(camera), pipeline(case.max_depth, SPP), device)
+    scheduler = gi.FrameScheduler(scene, gi.CameraPath.still(camera), pipeline(case.max_depth, spp), device)
     renderers = {OURS: lambda index: scheduler.frame(index).numpy("beauty").copy()}
     rows: list[Row] = []
     for variant in VARIANTS:
         try:
-            renderers[f"mitsuba {variant}"] = mitsuba_peer.renderer(scene, camera, case.peer, SPP, variant)
+            renderers[f"mitsuba {variant}"] = mitsuba_peer.renderer(scene, camera, case.peer, spp, variant)
         except mitsuba_peer.PeerMissing as missing_peer:
             rows.append({"case": case.name, "skipped": str(missing_peer)})
     taken = take_turns(renderers, repetitions, device, keep=repetitions, pause=PAUSE)
     pictures = {name: one.results for name, one in taken.items()}
     shown = {name: group[0] for name, group in pictures.items()}
-    gallery.add(PictureSet(f"{case.name}, {SPP} samples a pixel", scatter.mean_of(pictures).astype(np.float32), shown))
-    return rows + rows_of(case.name, size, taken)
+    gallery.add(PictureSet(f"{case.name}, {spp} samples a pixel", scatter.mean_of(pictures).astype(np.float32), shown))
+    return rows + rows_of(case.name, size, spp, taken)
 
 
-def rows_of(case: str, size: tuple[int, int], taken: Mapping[str, Taken[np.ndarray]]) -> list[Row]:
+def rows_of(case: str, size: tuple[int, int], spp: int, taken: Mapping[str, Taken[np.ndarray]]) -> list[Row]:
     """Return rows of renderers that took turns, ours first: equal samples, equal time, equal error, and ratios."""
     pictures = {name: one.results for name, one in taken.items()}
-    about: Row = {"case": case, "pixels": f"{size[0]}x{size[1]}", "spp": SPP}
+    about: Row = {"case": case, "pixels": f"{size[0]}x{size[1]}", "spp": spp}
     equal_samples = {
         name: {"table": "equal samples", **about, "renderer": name, **one.row(), **scatter.errors(pictures, name)}
         for name, one in taken.items()
@@ -133,7 +136,13 @@ def _equal_time_row(case: str, name: str, row: Row, seconds: float, ours: float)
     Independent samples keep to it; ours are stratified and fall a little faster.
     """
     samples = ours / seconds
-    found: Row = {"table": "equal time", "case": case, "renderer": name, "s": ours, "samples a pixel": SPP * samples}
+    found: Row = {
+        "table": "equal time",
+        "case": case,
+        "renderer": name,
+        "s": ours,
+        "samples a pixel": row["spp"] * samples,
+    }
     return found | {"RMSE": row["RMSE"] / samples**0.5, "relMSE": row["relMSE"] / samples}
 
 
@@ -142,7 +151,7 @@ def _equal_error_row(case: str, name: str, row: Row, target: float) -> Row:
     samples = row["relMSE"] / target
     found: Row = {"table": "equal error", "case": case, "renderer": name, "relMSE": target}
     return found | {
-        "samples a pixel": SPP * samples,
+        "samples a pixel": row["spp"] * samples,
         "wall s": row["wall s"] * samples,
         "cpu s": row["cpu s"] * samples,
     }
@@ -151,13 +160,13 @@ def _equal_error_row(case: str, name: str, row: Row, target: float) -> Row:
 # ---- in processes of their own ----
 
 
-def first_frames(device: str) -> list[Row]:
-    """Return seconds from the start of Python to a finished 480x270 frame at 16 samples, cold and warm kernel cache."""
+def first_frames(device: str, quick: bool) -> list[Row]:
+    """Return seconds from the start of Python to a finished frame at 16 samples, cold and warm kernel cache."""
     rows = []
-    for scene, place in FIRST_FRAMES.items():
+    for scene, place in list(FIRST_FRAMES.items())[: 1 if quick else None]:
         with tempfile.TemporaryDirectory() as cache:
             for state in ("cold", "warm"):
-                row = _child(place, (480, 270), 16, device, cache)
+                row = _child(place, QUICK_SIZE if quick else SIZE, 16, device, cache)
                 rows.append({"table": "first frame", "case": f"first frame of {scene}, {state} kernel cache"} | row)
     return rows
 
@@ -216,7 +225,7 @@ def _child_main(place: str, width: str, height: str, spp: str, device: str) -> N
 def main() -> None:
     """Print the rows, as tables and as lines of JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a ninth of the pixels")
+    parser.add_argument("--quick", action="store_true", help="half of the cases, smaller")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--child", nargs=5, help=argparse.SUPPRESS)
     options = parser.parse_args()

@@ -51,7 +51,7 @@ class Size:
     spp: int
 
 
-FULL_SIZE, QUICK_SIZE = Size(500, "240x135", 4), Size(12, "160x90", 4)
+FULL_SIZE, QUICK_SIZE = Size(500, "160x90", 4), Size(12, "160x90", 4)
 
 
 def run(quick: bool = False, device: str = "cpu") -> list[Row]:

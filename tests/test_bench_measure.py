@@ -117,21 +117,21 @@ def test_renderers_are_compared_at_equal_samples_time_and_error():
     def taken(wall: float, sigma: float, seed: int) -> measure.Taken:
         return measure.Taken([wall] * 4, [2 * wall] * 4, [], _noisy(4, sigma, seed))
 
-    rows = path.rows_of("a case", (50, 40), {"ours": taken(1.0, 0.1, 1), "mitsuba x": taken(4.0, 0.2, 2)})
+    rows = path.rows_of("a case", (50, 40), 64, {"ours": taken(1.0, 0.1, 1), "mitsuba x": taken(4.0, 0.2, 2)})
     by = {(row["table"], row.get("renderer", row.get("peer"))): row for row in rows}
     assert len(by) == len(rows) == 7
     ours, theirs = by["equal samples", "ours"], by["equal samples", "mitsuba x"]
-    assert (ours["pixels"], ours["spp"], ours["wall s"], theirs["cpu s"]) == ("50x40", path.SPP, 1.0, 8.0)
+    assert (ours["pixels"], ours["spp"], ours["wall s"], theirs["cpu s"]) == ("50x40", 64, 1.0, 8.0)
     share = theirs["relMSE"] / ours["relMSE"]
     assert share == pytest.approx(4.0, rel=0.1)
     assert by["equal time", "ours"]["relMSE"] == ours["relMSE"]
     same_time = by["equal time", "mitsuba x"]
-    assert same_time["samples a pixel"] == path.SPP / 4 and same_time["s"] == 2.0
+    assert same_time["samples a pixel"] == 64 / 4 and same_time["s"] == 2.0
     assert same_time["relMSE"] == pytest.approx(4 * theirs["relMSE"])
     assert same_time["RMSE"] == pytest.approx(2 * theirs["RMSE"])
     same_error = by["equal error", "mitsuba x"]
     assert same_error["wall s"] == pytest.approx(4 * share) and same_error["relMSE"] == ours["relMSE"]
-    assert same_error["samples a pixel"] == pytest.approx(path.SPP * share)
+    assert same_error["samples a pixel"] == pytest.approx(64 * share)
     beside = by["beside peers", "mitsuba x"]
     assert beside["faster, wall"] == beside["faster, cpu"] == 4.0
     assert beside["error ratio"] == pytest.approx(1 / share)
