@@ -7,7 +7,6 @@ import json
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench import mitsuba_peer, path, places, presets, rays, scatter
-from warp_gi.bench.dvf_views import CASES, QUICK_CASES, QUICK_SIZE, SIZE
+from warp_gi.bench.dvf_views import CASES, QUICK_CASES, QUICK_SETTINGS, QUICK_SIZE, SIZE
 from warp_gi.bench.measure import Row, Taken, peak_memory, take_turns
 from warp_gi.bench.stages import LAMBERT, Case, timed_bake
 from warp_gi.bvh import TriangleBvh
@@ -147,12 +146,15 @@ def bake_rows(quick: bool, device: str) -> list[Row]:
     place = CASES[0]
     if place.missing:
         return [{"table": "bake rate", "case": place.name, "skipped": place.missing}]
-    size = QUICK_SIZE if quick else SIZE
-    rate = bake_rate(
-        place.name, place.scene(), place.camera().at_resolution(*size), device, 200_000 if quick else 1_000_000
-    )
-    flight = flight_bake((240, 135) if quick else (960, 540), 8 if quick else 48, device)
-    return [rate, flight]
+    size, count = (QUICK_SIZE, 200_000) if quick else (SIZE, 1_000_000)
+    camera = place.camera().at_resolution(*size)
+    rate = bake_rate(place.name, place.scene(), camera, device, count, flight_field(quick))
+    return [rate, flight_bake((96, 54) if quick else (960, 540), 4 if quick else 48, device, quick)]
+
+
+def flight_field(quick: bool) -> gi.VisibilityField:
+    """Return the field that is baked: the default, or a coarse one."""
+    return gi.VisibilityField(**QUICK_SETTINGS if quick else {})
 
 
 def bake_rate(
@@ -161,33 +163,29 @@ def bake_rate(
     camera: gi.Camera,
     device: str,
     count: int,
-    field: gi.VisibilityField = OURS["field, map"],
+    field: gi.VisibilityField,
 ) -> Row:
     """Return million rays a second of a view's bake and of ``count`` cosine-distributed any-hit rays."""
     geometry = scene.data(device).geometry
     points, indices = geometry.points.numpy(), geometry.indices.numpy().reshape(-1, 3)
     tree = TriangleBvh(points, indices, device)
     origins, directions = rays.diffuse_rays(points, indices, count)
-    tree.occluded(origins, directions)
-    taken = []
-    for _ in range(3):
-        wall, cpu = time.perf_counter(), time.process_time()
-        tree.occluded(origins, directions).numpy()
-        taken.append((time.perf_counter() - wall, time.process_time() - cpu))
-    raw_wall, raw_cpu = np.median(taken, axis=0)
+    raw = take_turns({"raw": lambda turn: tree.occluded(origins, directions).numpy()}, 3, device)["raw"]
+    raw_wall, raw_cpu = raw.times
     timed_bake(scene, replace(field, samples=1), device, camera.at_resolution(16, 9))  # compiles
     bake, (wall, cpu) = timed_bake(scene, field, device, camera)
     traced = bake.counts["rays_traced"]
     row: Row = {"table": "bake rate", "case": name, "threads": launch.thread_count(), "cells": bake.counts["cells"]}
     row |= {"rays asked": bake.counts["rays"], "rays traced": traced, "wall s": wall, "cpu s": cpu}
-    row |= {"Mrays/wall s": traced / wall / 1e6, "raw Mrays/wall s": count / float(raw_wall) / 1e6}
-    row |= {"Mrays/cpu s": traced / max(cpu, 1e-9) / 1e6, "raw Mrays/cpu s": count / float(raw_cpu) / 1e6}
+    row |= {"Mrays/wall s": traced / wall / 1e6, "raw Mrays/wall s": count / raw_wall / 1e6}
+    row |= {"Mrays/cpu s": traced / max(cpu, 1e-9) / 1e6, "raw Mrays/cpu s": count / raw_cpu / 1e6}
     return row | {"bake / raw, cpu": row["Mrays/cpu s"] / row["raw Mrays/cpu s"]}
 
 
-def flight_bake(size: tuple[int, int], frames: int, device: str) -> Row:
+def flight_bake(size: tuple[int, int], frames: int, device: str, quick: bool = False) -> Row:
     """Return seconds, cells, memory and file size of the lazy bake of a flight through Sponza, in its own process."""
     arguments = [sys.executable, "-m", "warp_gi.bench.dvf_peers", "--child", *map(str, (*size, frames)), device]
+    arguments += ["--quick"] if quick else []
     done = subprocess.run(arguments, capture_output=True, text=True, check=False)
     row: Row = {"table": "flight bake", "case": FLIGHT.name, "pixels": f"{size[0]}x{size[1]}", "frames": frames}
     if done.returncode:
@@ -201,7 +199,7 @@ def flight(size: tuple[int, int], frames: int) -> gi.CameraPath:
     return replace(nave, fps=(frames - 1) / nave.keys[-1].time, resolution=size)
 
 
-def _child_main(width: str, height: str, frames: str, device: str) -> None:
+def _child_main(width: str, height: str, frames: str, device: str, quick: bool) -> None:
     import warp as wp
 
     wp.config.quiet = True
@@ -209,7 +207,8 @@ def _child_main(width: str, height: str, frames: str, device: str) -> None:
     scene = FLIGHT.scene()
     scene.data(device)
     before = peak_memory()
-    bake, (wall, cpu) = timed_bake(scene, gi.VisibilityField(), device, flight((int(width), int(height)), int(frames)))
+    nave = flight((int(width), int(height)), int(frames))
+    bake, (wall, cpu) = timed_bake(scene, flight_field(quick), device, nave)
     row: Row = {"wall s": wall, "cpu s": cpu, "peak GB": peak_memory() / 1e9, "peak GB before": before / 1e9}
     row |= {name: bake.counts[name] for name in ("cells", "samples", "rays", "rays_traced")}
     with tempfile.TemporaryDirectory() as folder:
@@ -254,7 +253,9 @@ def main() -> None:
     """Bake the flight in this process and print a line of JSON; run the suite with ``warp-gi bench dvf``."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--child", nargs=4, required=True, help=argparse.SUPPRESS)
-    _child_main(*parser.parse_args().child)
+    parser.add_argument("--quick", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    _child_main(*options.child, options.quick)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ def view() -> dvf_views.View:
 def test_mode_rows_hold_ratios_and_errors(view, monkeypatch):
     monkeypatch.setitem(dvf.PAPER, "samples", 3000)
     gallery = Gallery()
-    rows = dvf.mode_rows("box", view, 1, 4.0, gallery)
+    rows = dvf.mode_rows("box", view, 1, 4.0, gallery=gallery)
     assert [row["mode"] for row in rows] == [*dvf.MODES, "paper, its settings"]
     assert len({tuple(row) for row in rows}) == 1  # one table
     for row in rows:
