@@ -6,16 +6,14 @@ The time of a pipeline is that of its frames, without compilation and without wh
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import warp as wp
 
 import warp_gi as gi
-from warp_gi import launch
 from warp_gi.bench.compare_reference import Reference, StillFrames
+from warp_gi.bench.measure import timed
 
 
 @dataclass(frozen=True)
@@ -70,13 +68,8 @@ class Run:
 
     def step(self, reference: Reference, limit: float) -> None:
         """Render a frame, and measure the mean of all; see ``add``."""
-        compiled, wall, cpu = launch.compile_seconds, time.perf_counter(), time.process_time()
-        frame = self.frames.next()
-        wp.synchronize_device(frame.device)
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        compiled = launch.compile_seconds - compiled
-        picture = frame.numpy("beauty").astype(np.float64)
-        self.add(picture, wall - compiled, max(cpu - compiled, 0.0), reference, limit)
+        frame, times = timed(self.frames.next)
+        self.add(frame.numpy("beauty").astype(np.float64), *times, reference, limit)
 
     def add(self, picture: np.ndarray, wall: float, cpu: float, reference: Reference, limit: float) -> None:
         """Take over a frame and its seconds; none that ends after ``limit`` and is not the first: it was the last."""

@@ -7,7 +7,6 @@ a line of JSON, and leaves what was baked in the folder.
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,18 +14,15 @@ from pathlib import Path
 import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench.compare_reference import StillFrames
-from warp_gi.bench.measure import Row, peak_memory, timed
+from warp_gi.bench.measure import Row, in_process, peak_memory, timed
 from warp_gi.errors import GiError
 
 
 def setup_of(pipeline: str, folder: Path, arguments: Sequence[str]) -> tuple[Row, list[gi.Bake]]:
     """Return seconds and peak memory of a pipeline by its name, and its bakes; a row that says so if that fails."""
-    command = [sys.executable, "-m", "warp_gi.bench.compare_setup", pipeline, str(folder), *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        return {"failed": (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]}, []
-    bakes = [gi.load_bake(path) for path in sorted(folder.glob("*.safetensors"))]
-    return json.loads(done.stdout.strip().splitlines()[-1]), bakes
+    row = in_process(["warp_gi.bench.compare_setup", pipeline, str(folder), *arguments])
+    bakes = [] if "failed" in row else [gi.load_bake(path) for path in sorted(folder.glob("*.safetensors"))]
+    return row, bakes
 
 
 def main(arguments: Sequence[str]) -> int:

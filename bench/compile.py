@@ -6,8 +6,6 @@ Each time is from a process of its own. Quick: the modules that a frame of the p
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -18,7 +16,7 @@ import warp as wp
 import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench.compile_cuda import kernel_modules
-from warp_gi.bench.measure import Row
+from warp_gi.bench.measure import Row, in_process
 from warp_gi.bench.places import PLACES
 
 OBJECTS = (".o", ".obj", ".cubin", ".ptx")
@@ -57,12 +55,9 @@ def _cold_and_warm(name: str, device: str) -> Row:
     row: Row = {}
     with tempfile.TemporaryDirectory() as cache:
         for state in STATES:
-            command = [sys.executable, "-m", "warp_gi.bench.compile", name, device]
-            environment = {**os.environ, "WARP_CACHE_PATH": cache}
-            done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-            if done.returncode:
-                return {"failed": (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]}
-            found = json.loads(done.stdout.strip().splitlines()[-1])
+            found = in_process(["warp_gi.bench.compile", name, device], WARP_CACHE_PATH=cache)
+            if "failed" in found:
+                return found
             row[f"{state} s"] = found["seconds"]
         sizes = [path.stat().st_size for path in Path(cache).rglob("*") if path.suffix in OBJECTS]
     row["object kB"] = sum(sizes) / 1e3

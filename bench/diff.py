@@ -27,6 +27,10 @@ PEERS = ("mitsuba", "embree", "blender")
 SPREADS = ("spread", "+-", "±")
 SERIES = re.compile(r"[-+.\deE]+(\s+[-+.\deE]+)+")
 """Numbers in words, an outcome."""
+SPREADS_APART, LEAST_SHARE = 2.0, 0.03
+"""How many of both spreads, half of the middle half each, medians of a few turns may differ by: one of twenty medians
+of five turns of the same does by more. The share is what runs of one machine differ by in any case; quick ones have too
+few turns to know their spread, and take the share of values without one."""
 Identity = tuple[tuple[str, Any], ...]
 
 
@@ -46,14 +50,16 @@ ERROR, ACCURACY, MEMORY = Measure(False, 0.05, False), Measure(True, 0.05, False
 
 RULES: tuple[tuple[str, Measure | None], ...] = (
     (r"\bpaper|\b(in|for) this\b", None),
-    (r"faster|speed-?up|efficiency|^times |(^| )x$|^ratio (wall|cpu)|^(ours|in order) / |/ ours$", RATE),
+    (r"faster|speed-?up|efficiency|^times |(^| )x$|^ratio (wall|cpu|device)$", RATE),
+    (r"^(ours|in order) / |/ ours$|/ raw,|^of tree$", RATE),
     (r"^(mitsuba|embree|blender|warp|tree|raw|traced|without)\b", None),  # peers and baselines: not ours to be slower
     (r"/ ?((wall|cpu) )?s$|\ba minute$", RATE),
     (r"\bagree|\bPSNR\b", ACCURACY),
     (r"\bequal time$|\b(time|cost|paths) / baseline$", TIME),
     (r"\bequal samples$|/ baseline$|MSE\b|\bbad pixels\b|\bFLIP\b|\berrors?\b|\bwrong\b|\bbias\b", ERROR),
+    (r"\buntil settled$|^dark / lit$|^peak / settled$", ERROR),
     (r"^(exponent|growth)\b", TIME),
-    (r"\b(bytes|[KMG]i?B)\b", MEMORY),
+    (r"\b(bytes|[kKMG]i?B)\b", MEMORY),
     (r"(^|[ (])(ns|us|µs|ms|s|seconds|minutes)($|[ ,)])", TIME),
 )
 """The first that is found in a column's name tells; a column without a rule is neither better nor worse."""
@@ -152,14 +158,15 @@ def _compare_rows(found: Difference, identity: Identity, old: records.Row, new: 
 
 
 def _limit(column: str, old: records.Row, new: records.Row, measure: Measure | None, tolerance: Any) -> float:
-    """Return the change that is within the spread: where the two intervals touch, or a share of the old value."""
+    """Return the change that is within the spread: what both spreads allow, or a share of the old value."""
     spreads = [
         [row[f"{column} {s}"] for s in SPREADS if records.is_number(row.get(f"{column} {s}"))] for row in (old, new)
     ]
+    usual = measure.tolerance if measure else ERROR.tolerance
     if all(spreads):
-        return abs(spreads[0][0]) + abs(spreads[1][0])
-    share = tolerance if tolerance is not None else measure.tolerance if measure else ERROR.tolerance
-    return share * abs(old[column])
+        least = usual if old.get("quick") else LEAST_SHARE
+        return max(SPREADS_APART * (abs(spreads[0][0]) + abs(spreads[1][0])), least * abs(old[column]))
+    return (usual if tolerance is None else tolerance) * abs(old[column])
 
 
 def _exceeds(change: Change) -> bool:

@@ -1,20 +1,19 @@
 """Visibility fields: tracing the sky's light with and without them, what settings do, equal error, bakes.
 
-``python -m warp_gi.bench.dvf [--quick]``. Field and baseline (``mode="traced"``) are one kernel with the same rays, so
+Field and baseline (``mode="traced"``) are one kernel with the same rays, so
 a ratio is what the field saves and a difference of their pictures is its error. Seconds are of the sky light's stage
 alone, primary rays apart, except where a row says otherwise. What the paper measured stands in columns of its own.
 """
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from warp_gi.bench import dvf_peers, runner
+from warp_gi.bench import dvf_peers
 from warp_gi.bench.dvf_views import CASES, QUICK_CASES, QUICK_SIZE, SIZE, FieldStage, View, glossy, quality
-from warp_gi.bench.gallery import CLOSED, Gallery, PictureSet
-from warp_gi.bench.measure import Row, Taken, ratios
+from warp_gi.bench.gallery import CLOSED, Gallery, PictureSet, run_parts
+from warp_gi.bench.measure import Row, Taken, attempt, ratios
 from warp_gi.bench.stages import Case, race, rmse
 
 SPP = 64
@@ -36,14 +35,26 @@ MODES: dict[str, dict[str, Any]] = {
 }
 
 
-def run(quick: bool = False, device: str = "cpu", gallery: Gallery = CLOSED) -> list[Row]:
+def run(quick: bool = False, device: str = "cpu", parts: Sequence[str] = (), gallery: Gallery = CLOSED) -> list[Row]:
     """Return rows of all tables; ``quick`` takes two scenes, coarse fields, few pixels and settings."""
+    return run_parts(PARTS, parts, quick, device, gallery)
+
+
+def case_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
+    """Return what is measured on each scene."""
     rows: list[Row] = []
-    for place in QUICK_CASES if quick else CASES:
-        rows += place_rows(place, quick, device, gallery)
-    rows += dvf_peers.equal_error_rows(quick, device)
-    rows += dvf_peers.bake_rows(quick, device)
-    return rows + dvf_peers.relight_rows(quick, device)
+    for case in QUICK_CASES if quick else CASES:
+        said = {"table": "modes", "case": case.name}
+        rows += attempt(said, lambda case=case: place_rows(case, quick, device, gallery))
+    return rows
+
+
+PARTS = {
+    "modes": case_rows,
+    "equal error": dvf_peers.equal_error_rows,
+    "bakes": dvf_peers.bake_rows,
+    "relight": dvf_peers.relight_rows,
+}
 
 
 def place_rows(place: Case, quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
@@ -144,21 +155,7 @@ def sweep_rows(view: View, repetitions: int, quick: bool, spp: int = SPP) -> lis
         taken = race({"traced": traced, "field": stage}, repetitions, view.device)
         rows.append(row | _faster(taken, "field") | quality(stage, traced))
     paper = [
-        {"table": f"memory: paper, {CARD}", "case": name, "paper MB": kb * 1024e-6} for name, kb in PAPER_KB.items()
+        {"table": f"Sponza by cell size: paper, {CARD}", "case": name, "paper MB": kb * 1024e-6}
+        for name, kb in PAPER_KB.items()
     ]
     return rows + paper
-
-
-def main() -> None:
-    """Print the rows, as tables and as lines of JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="two scenes, coarse fields, few pixels")
-    parser.add_argument("--device", default="cpu")
-    options = parser.parse_args()
-    rows = run(options.quick, options.device)
-    runner.print_rows("dvf", rows)
-    print(runner.json_lines("dvf", rows, options.quick, options.device), end="")
-
-
-if __name__ == "__main__":
-    main()

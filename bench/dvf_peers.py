@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
 import json
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
@@ -18,7 +16,7 @@ import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench import mitsuba_peer, path, places, presets, rays, scatter
 from warp_gi.bench.dvf_views import CASES, QUICK_CASES, QUICK_SETTINGS, QUICK_SIZE, SIZE
-from warp_gi.bench.measure import Row, Taken, peak_memory, take_turns
+from warp_gi.bench.measure import Row, Taken, in_process, peak_memory, take_turns
 from warp_gi.bench.stages import LAMBERT, Case, timed_bake
 from warp_gi.bvh import TriangleBvh
 from warp_gi.scene import harmonics
@@ -102,7 +100,7 @@ def equal_error(
                 renderers[name] = mitsuba_peer.renderer(scene, camera, integrator, SPP)
         except mitsuba_peer.PeerMissing as missing:
             rows.append({"table": "equal error", "case": place.name, "sky": sky, "skipped": str(missing)})
-    taken = take_turns(renderers, repetitions, device, keep=repetitions, pause=path.PAUSE)
+    taken = take_turns(renderers, repetitions, device, keep=repetitions, pause=path.PAUSE, host=MITSUBA)
     return rows + equal_error_table(place.name, sky, taken)
 
 
@@ -184,13 +182,8 @@ def bake_rate(
 
 def flight_bake(size: tuple[int, int], frames: int, device: str, quick: bool = False) -> Row:
     """Return seconds, cells, memory and file size of the lazy bake of a flight through Sponza, in its own process."""
-    arguments = [sys.executable, "-m", "warp_gi.bench.dvf_peers", "--child", *map(str, (*size, frames)), device]
-    arguments += ["--quick"] if quick else []
-    done = subprocess.run(arguments, capture_output=True, text=True, check=False)
     row: Row = {"table": "flight bake", "case": FLIGHT.name, "pixels": f"{size[0]}x{size[1]}", "frames": frames}
-    if done.returncode:
-        return row | {"failed": (done.stderr.strip().splitlines() or ["no message"])[-1]}
-    return row | json.loads(done.stdout.strip().splitlines()[-1])
+    return row | in_process(["warp_gi.bench.dvf_peers", *map(str, (*size, frames)), device, *["quick"] * quick])
 
 
 def flight(size: tuple[int, int], frames: int) -> gi.CameraPath:
@@ -199,7 +192,7 @@ def flight(size: tuple[int, int], frames: int) -> gi.CameraPath:
     return replace(nave, fps=(frames - 1) / nave.keys[-1].time, resolution=size)
 
 
-def _child_main(width: str, height: str, frames: str, device: str, quick: bool) -> None:
+def _child_main(width: str, height: str, frames: str, device: str, quick: str = "") -> None:
     import warp as wp
 
     wp.config.quiet = True
@@ -208,9 +201,10 @@ def _child_main(width: str, height: str, frames: str, device: str, quick: bool) 
     scene.data(device)
     before = peak_memory()
     nave = flight((int(width), int(height)), int(frames))
-    bake, (wall, cpu) = timed_bake(scene, flight_field(quick), device, nave)
+    bake, (wall, cpu) = timed_bake(scene, flight_field(bool(quick)), device, nave)
     row: Row = {"wall s": wall, "cpu s": cpu, "peak GB": peak_memory() / 1e9, "peak GB before": before / 1e9}
-    row |= {name: bake.counts[name] for name in ("cells", "samples", "rays", "rays_traced")}
+    row |= {name: bake.counts[name] for name in ("cells", "rays", "rays_traced")}
+    row["samples taken"] = bake.counts["samples"]
     with tempfile.TemporaryDirectory() as folder:
         row["file MB"] = bake.save(Path(folder) / "bake.safetensors").stat().st_size / 1e6
     print(json.dumps(row, default=float))
@@ -249,14 +243,5 @@ def relight(
     return rows
 
 
-def main() -> None:
-    """Bake the flight in this process and print a line of JSON; run the suite with ``warp-gi bench dvf``."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("--child", nargs=4, required=True, help=argparse.SUPPRESS)
-    parser.add_argument("--quick", action="store_true", help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    _child_main(*options.child, options.quick)
-
-
 if __name__ == "__main__":
-    main()
+    _child_main(*sys.argv[1:])

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from warp_gi.bench.measure import Row, attempt
 from warp_gi.errors import OptionError
 
 REFERENCE = "reference"
@@ -86,10 +87,20 @@ CLOSED = Gallery(is_open=False)
 """Where no report is written."""
 
 
-def call(measure: Callable[..., Any], quick: bool, device: str, gallery: Gallery) -> Any:
+def call(measure: Callable[..., Any], quick: bool, device: str, gallery: Gallery, **others: Any) -> Any:
     """Call a suite's ``run``, or a part of one, with the gallery if it takes one."""
     given = {"gallery": gallery} if "gallery" in inspect.signature(measure).parameters else {}
-    return measure(quick=quick, device=device, **given)
+    return measure(quick=quick, device=device, **given, **others)
+
+
+def run_parts(
+    parts: Mapping[str, Callable[..., list[Row]]], chosen: Sequence[str], quick: bool, device: str, gallery: Gallery
+) -> list[Row]:
+    """Return the rows of a suite's parts, all of them if none is chosen; one that fails is a row that says why."""
+    rows: list[Row] = []
+    for name in chosen or parts:
+        rows += attempt({"part": name}, lambda name=name: call(parts[name], quick, device, gallery))
+    return rows
 
 
 def block_means(picture: np.ndarray, size: int) -> np.ndarray:

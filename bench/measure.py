@@ -6,10 +6,14 @@ host does before and after.
 
 from __future__ import annotations
 
+import json
+import os
 import resource
+import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+import traceback
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
@@ -77,11 +81,13 @@ def take_turns(
     keep: int = 0,
     pause: float = 0.0,
     warm: bool = True,
+    host: Collection[str] = (),
 ) -> dict[str, Taken[T]]:
     """Let each contender do its work ``repetitions`` times, one after the other in each round.
 
     They are called with the number of the round, from 1 on. ``warm`` calls each with 0 before, uncounted, which
-    compiles and fills caches. ``pause`` seconds before a turn let the threads of the one before go to sleep.
+    compiles and fills caches. ``pause`` seconds before a turn let the threads of the one before go to sleep. ``host``
+    names those that run on the CPU whatever the device is.
     """
     if warm:
         for work in contenders.values():
@@ -90,7 +96,7 @@ def take_turns(
     for index in range(1, repetitions + 1):
         for name, work in contenders.items():
             time.sleep(pause)
-            taken[name].add(lambda work=work, index=index: work(index), device, keep)
+            taken[name].add(lambda work=work, index=index: work(index), "cpu" if name in host else device, keep)
     return taken
 
 
@@ -108,7 +114,7 @@ def clocked(work: Callable[[], T], device: str = "cpu") -> tuple[T, Times, float
     wp.synchronize()
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     compiled = launch.compile_seconds - compiled
-    on_device = wp.get_event_elapsed_time(*events) / 1e3 if events else None
+    on_device = max(wp.get_event_elapsed_time(*events) / 1e3 - compiled, 0.0) if events else None
     return result, (wall - compiled, max(cpu - compiled, 0.0)), on_device
 
 
@@ -140,6 +146,34 @@ def ratios(name: str, above: Taken[Any], below: Taken[Any]) -> Row:
     return {k: v for kind, a, b in pairs for k, v in ratio_and_spread(name.format(kind), a, b).items()}
 
 
+# ---- apart from the rest ----
+
+
+def in_process(arguments: Sequence[str], **variables: str) -> Row:
+    """Return the JSON object that a module of ours prints last, in a process of its own; {"failed": why} if it fails.
+
+    ``arguments`` are a module and what it is given; ``variables`` are of its environment. It has as many threads as
+    this process.
+    """
+    environment = {**os.environ, "WARP_GI_THREADS": str(launch.thread_count()), **variables}
+    command = [sys.executable, "-m", *arguments]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    said, found = (text.strip().splitlines() for text in (done.stderr, done.stdout))
+    if done.returncode or not found:
+        return {"failed": said[-1] if said else f"exit code {done.returncode}, without a word"}
+    return json.loads(found[-1])
+
+
+def attempt(said: Row, work: Callable[[], list[Row]]) -> list[Row]:
+    """Return the rows of ``work``, or if it fails the row ``said`` with why: the rest of a suite goes on."""
+    try:
+        return work()
+    except Exception as error:
+        if os.environ.get("WARP_GI_DEBUG", "0") != "0":
+            traceback.print_exc()
+        return [{**said, "failed": f"{type(error).__name__}: {' '.join(str(error).split())}"}]
+
+
 # ---- memory ----
 
 
@@ -156,7 +190,8 @@ class PeakMemory:
         for other in PeakMemory._live:
             other._seen = max(other._seen, before)
         self._seen = 0.0
-        _forget_peak()
+        self.is_anew = _forget_peak()
+        """Whether it is of what was done since this was made, and not of the whole process."""
         PeakMemory._live.add(self)
 
     @property

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from warp_gi import launch
+
 if TYPE_CHECKING:
     import warp_gi as gi
 
@@ -36,12 +38,15 @@ LLVM, SCALAR = "llvm_ad_rgb", "scalar_rgb"
 
 
 def load_mitsuba(variant: str = LLVM) -> Any:
-    """Return the module ``mitsuba`` with ``variant`` set, which stays so until another is loaded.
+    """Return the module ``mitsuba`` with ``variant`` set, until another is loaded, and with as many threads as we use.
 
     Finds LLVM 19 unless DRJIT_LIBLLVM_PATH names one. Raises PeerMissing with what to install.
     """
     mitsuba = _started(variant)
     mitsuba.set_variant(variant)
+    import drjit
+
+    drjit.set_thread_count(launch.thread_count())
     return mitsuba
 
 
@@ -183,6 +188,8 @@ def to_mitsuba(scene: gi.Scene, camera: gi.Camera, variant: str = LLVM) -> Any:
     Raises PeerMissing without Mitsuba, and ValueError for what it has no equal for: normal
     maps, emission by texture or on both sides, punctual lights.
     """
+    if scene.lights:
+        raise ValueError("punctual lights are not converted; take them off first")
     mi = load_mitsuba(variant)
     geometry = scene.data("cpu").geometry
     arrays = {name: getattr(geometry, name).numpy() for name in ("points", "normals", "uvs", "indices", "materials")}

@@ -1,30 +1,27 @@
 """Speed of the whole: path tracing and direct light beside Mitsuba 3, LLVM and scalar; first frames; memory.
 
-``python -m warp_gi.bench.path [--quick]``. All renderers get the same triangles, Lambert
-materials without alpha masks, samples and depth, take turns in one process, and have
-compiled before the clock starts. All are unbiased (the tests see to that), so the error
-of a picture is its scatter over repetitions with independent seeds.
+All renderers get the same triangles, Lambert materials without alpha masks, samples and depth, take turns in one
+process with as many threads, and have compiled before the clock starts. Our samples share camera rays, see
+``CAMERA_SAMPLES``. All are unbiased (the tests see to that), so the error of a picture is its scatter over repetitions
+with independent seeds.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 import warp_gi as gi
-from warp_gi.bench import mitsuba_peer, runner, scatter
-from warp_gi.bench.gallery import CLOSED, Gallery, PictureSet
-from warp_gi.bench.measure import Row, Taken, peak_memory, ratios, take_turns
+from warp_gi.bench import mitsuba_peer, scatter
+from warp_gi.bench.gallery import CLOSED, Gallery, PictureSet, run_parts
+from warp_gi.bench.measure import Row, Taken, attempt, in_process, peak_memory, ratios, take_turns
 from warp_gi.bench.places import PLACES
 from warp_gi.bench.stages import DARK, LAMBERT, Case
 
@@ -73,11 +70,17 @@ FIRST_FRAMES = {"atrium": "atrium", "crytek_sponza.glb": "sponza"}
 """Places by their names in rows."""
 
 
-def run(quick: bool = False, device: str = "cpu", gallery: Gallery = CLOSED) -> list[Row]:
+def run(quick: bool = False, device: str = "cpu", parts: Sequence[str] = (), gallery: Gallery = CLOSED) -> list[Row]:
     """Return rows of figures for each case, first frame and memory limit; ``quick`` takes half of them, smaller."""
-    cases = QUICK_CASES if quick else CASES
-    rows = [row for case in cases for row in compare(case, quick, device, gallery)]
-    return [*rows, *first_frames(device, quick), *bistro_memory(device, quick)]
+    return run_parts(PARTS, parts, quick, device, gallery)
+
+
+def case_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
+    """Return the rows of all cases."""
+    rows: list[Row] = []
+    for case in QUICK_CASES if quick else CASES:
+        rows += attempt({"case": case.name}, lambda case=case: compare(case, quick, device, gallery))
+    return rows
 
 
 def pipeline(max_depth: int, spp: int) -> gi.Pipeline:
@@ -100,10 +103,11 @@ def compare(case: Picture, quick: bool, device: str, gallery: Gallery = CLOSED) 
             renderers[f"mitsuba {variant}"] = mitsuba_peer.renderer(scene, camera, case.peer, spp, variant)
         except mitsuba_peer.PeerMissing as missing_peer:
             rows.append({"case": case.name, "skipped": str(missing_peer)})
-    taken = take_turns(renderers, repetitions, device, keep=repetitions, pause=PAUSE)
+    peers = [name for name in renderers if name != OURS]
+    taken = take_turns(renderers, repetitions, device, keep=repetitions, pause=PAUSE, host=peers)
     pictures = {name: one.results for name, one in taken.items()}
-    shown = {name: group[0] for name, group in pictures.items()}
-    gallery.add(PictureSet(f"{case.name}, {spp} samples a pixel", scatter.mean_of(pictures).astype(np.float32), shown))
+    shown, others = ({name: group[part] for name, group in pictures.items()} for part in (0, slice(1, None)))
+    gallery.add(PictureSet(f"{case.name}, {spp} samples a pixel", scatter.mean_of(others).astype(np.float32), shown))
     return rows + rows_of(case.name, size, spp, taken)
 
 
@@ -124,8 +128,8 @@ def rows_of(case: str, size: tuple[int, int], spp: int, taken: Mapping[str, Take
         row = {"table": "beside peers", "case": case, "peer": name}
         row |= ratios("faster, {}", taken[name], taken[OURS])
         row["error ratio"] = ours["relMSE"] / equal_samples[name]["relMSE"]
-        for kind in ("wall", "cpu"):
-            row[f"faster at equal error, {kind}"] = row[f"faster, {kind}"] / row["error ratio"]
+        for key in [key for key in row if key.startswith("faster, ") and not key.endswith("spread")]:
+            row[key.replace("faster", "faster at equal error")] = row[key] / row["error ratio"]
         rows.append(row | {"means differ": float(np.mean(pictures[OURS]) / np.mean(pictures[name]) - 1)})
     return rows
 
@@ -150,59 +154,39 @@ def _equal_error_row(case: str, name: str, row: Row, target: float) -> Row:
     """Return what a renderer takes to get to our relMSE, by the same law."""
     samples = row["relMSE"] / target
     found: Row = {"table": "equal error", "case": case, "renderer": name, "relMSE": target}
-    return found | {
-        "samples a pixel": row["spp"] * samples,
-        "wall s": row["wall s"] * samples,
-        "cpu s": row["cpu s"] * samples,
-    }
+    found["samples a pixel"] = row["spp"] * samples
+    return found | {kind: row[kind] * samples for kind in ("wall s", "cpu s", "device s") if kind in row}
 
 
 # ---- in processes of their own ----
 
 
-def first_frames(device: str, quick: bool) -> list[Row]:
+def first_frames(quick: bool, device: str) -> list[Row]:
     """Return seconds from the start of Python to a finished frame at 16 samples, cold and warm kernel cache."""
     rows = []
     for scene, place in list(FIRST_FRAMES.items())[: 1 if quick else None]:
         with tempfile.TemporaryDirectory() as cache:
             for state in ("cold", "warm"):
-                row = _child(place, QUICK_SIZE if quick else SIZE, 16, device, cache)
+                row = _child(place, QUICK_SIZE if quick else SIZE, 16, device, WARP_CACHE_PATH=cache)
                 rows.append({"table": "first frame", "case": f"first frame of {scene}, {state} kernel cache"} | row)
     return rows
 
 
-def bistro_memory(device: str, quick: bool) -> list[Row]:
+def bistro_memory(quick: bool, device: str) -> list[Row]:
     """Return the peak resident memory of rendering the Bistro at 960x540."""
-    row = _child("bistro_wide", (960, 540), 2 if quick else 16, device, None)
+    row = _child("bistro_wide", (960, 540), 2 if quick else 16, device)
     return [{"table": "memory", "case": "Bistro at 960x540"} | row]
 
 
-def _child(place: str, size: tuple[int, int], spp: int, device: str, cache: str | None) -> Row:
+def _child(place: str, size: tuple[int, int], spp: int, device: str, **variables: str) -> Row:
     if PLACES[place].missing:
         return {"skipped": PLACES[place].missing}
-    environment = dict(os.environ)
-    if cache:
-        environment["WARP_CACHE_PATH"] = cache
     started = time.time()
-    arguments = [
-        sys.executable,
-        "-m",
-        "warp_gi.bench.path",
-        "--child",
-        place,
-        str(size[0]),
-        str(size[1]),
-        str(spp),
-        device,
-    ]
-    done = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode:
-        return {"failed": (done.stderr.strip().splitlines() or ["no message"])[-1]}
-    result = json.loads(done.stdout.strip().splitlines()[-1])
-    finished = result.pop("finished")
-    row = {"pixels": f"{size[0]}x{size[1]}", "spp": spp, "wall s": finished - started}
-    row["start s"] = finished - started - result["scene s"] - result["frame s"]
-    return row | result
+    row = in_process(["warp_gi.bench.path", place, *map(str, (*size, spp)), device], **variables)
+    if "failed" in row:
+        return row
+    said = {"pixels": f"{size[0]}x{size[1]}", "spp": spp, "wall s": row.pop("finished") - started}
+    return said | {"start s": said["wall s"] - row["scene s"] - row["frame s"]} | row
 
 
 def _child_main(place: str, width: str, height: str, spp: str, device: str) -> None:
@@ -222,20 +206,8 @@ def _child_main(place: str, width: str, height: str, spp: str, device: str) -> N
     print(json.dumps({"finished": finished, **seconds, "peak GB": peak_memory() / 1e9}))
 
 
-def main() -> None:
-    """Print the rows, as tables and as lines of JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="half of the cases, smaller")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--child", nargs=5, help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.child:
-        _child_main(*options.child)
-        return
-    rows = run(options.quick, options.device)
-    runner.print_rows("path", rows)
-    print(runner.json_lines("path", rows, options.quick, options.device), end="")
+PARTS = {"pictures": case_rows, "first frames": first_frames, "memory": bistro_memory}
 
 
 if __name__ == "__main__":
-    main()
+    _child_main(*sys.argv[1:])

@@ -60,7 +60,7 @@ def pipeline_rows(
             try:
                 scheduler = gi.FrameScheduler(scene, path, few, device, seed=1, bakes=bakes)
             except OptionError as missing:
-                row[f"{short} skipped"] = str(missing)
+                rows.append({"table": "denoise", "case": name, "denoiser": denoiser, "skipped": str(missing)})
                 continue
             seconds = []
             for index in range(FRAME + 1):

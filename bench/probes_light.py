@@ -119,7 +119,12 @@ def light_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]
         view = view_of(place, (160, 90) if quick else (320, 180), device, 64 if quick else 512)
         rows += mode_rows(place, view, settings[:1] if quick else settings, 3 if quick else 5, gallery)
     for name, counts, resolution, lambertian, glossy in PAPER_MS:
-        row = {"table": f"table 1: paper, {PAPER_CARD}", "case": name, "probes": counts, "resolution": resolution}
+        row = {
+            "table": f"indirect light: paper, {PAPER_CARD}",
+            "case": name,
+            "probes": counts,
+            "resolution": resolution,
+        }
         rows.append(row | {"Lambertian ms": lambertian, "glossy ms": glossy})
     return rows
 

@@ -45,6 +45,9 @@ def pages(root: Path) -> dict[Path, str]:
     if not files:
         raise OptionError(f"{root / 'bench/results'}: no *.jsonl there; `warp-gi bench SUITE --json FILE` writes them")
     rows = records.read(files)
+    for suite, found in records.environments(rows).items():
+        if len({one.get("quick", False) for one in found}) > 1:
+            raise OptionError(f"{root / 'bench/results'}: quick and full runs of suite {suite!r}; keep the full ones")
     return {PAGE: page(rows), README: readme((root / README).read_text(encoding="utf-8"), rows)}
 
 

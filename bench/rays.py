@@ -1,33 +1,28 @@
 """Ray queries and tree builds beside Embree 4 (embreex) and Warp's own mesh queries.
 
-``python -m warp_gi.bench.rays [--quick] [--scenes NAME ...] [--json FILE]``. All get the same rays and triangles, as
-NumPy arrays, and one thread each; they take turns in one process and the median CPU time counts. "ours" is the batch
-call, which on large trees traces incoherent rays in Morton order and returns them in theirs; "ours in order" is what
-a query inside a kernel costs. "embree" is its fast mode, which may leak through edges; "embree robust", watertight
-like ours, is what embreex makes by default.
+All get the same rays and triangles, as NumPy arrays, and one thread each; they take turns in one process and the median
+CPU time counts. "ours" is the batch call, which on large trees traces incoherent rays in Morton order and returns them
+in theirs; "ours in order" is what a query inside a kernel costs. "embree" is its fast mode, which may leak through
+edges; "embree robust", watertight like ours, is what embreex makes by default.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import warp as wp
 
 from warp_gi import bvh as bvh_module
 from warp_gi import launch
-from warp_gi.bench import presets, runner
-from warp_gi.bench.measure import PeakMemory, Row, Taken, median_and_spread, ratio_and_spread, take_turns
+from warp_gi.bench import presets
+from warp_gi.bench.measure import Row, attempt, median_and_spread, ratio_and_spread, take_turns
 from warp_gi.bench.places import PLACES, Place
 from warp_gi.bvh import TriangleBvh
 from warp_gi.camera import CameraKey
-from warp_gi.errors import unknown_name
 
 T = TypeVar("T")
 REPETITIONS = 5
@@ -35,6 +30,7 @@ RAYS = 1_000_000
 QUICK_RAYS = 200_000
 QUICK_SCENES = ("living room", "sponza", "atrium")
 NEVER = 1 << 62
+NO_EMBREE = "embreex is not installed: pip install embreex"
 EMBREE = {"embree": False, "embree robust": True}
 CASES = {
     "living room": "living_room",
@@ -45,28 +41,30 @@ CASES = {
     "street": "street",
 }
 """Places by their names in rows; primary rays are those of their cameras."""
+PARTS = CASES
 
 
-def run(quick: bool = False, device: str = "cpu", scenes: Sequence[str] | None = None) -> list[Row]:
-    """Return a row for each scene's builds and one for each kind of ray and query.
+def run(quick: bool = False, device: str = "cpu", parts: Sequence[str] = ()) -> list[Row]:
+    """Return a row for each scene's builds and one for each kind of ray and query; ``parts`` are scenes.
 
     ``quick`` takes three scenes and fewer rays. Scenes whose file is missing, and peers that are not installed, give
-    a row that says so. Raises OptionError for an unknown scene.
+    a row that says so.
     """
     rows: list[Row] = []
-    for name in scenes or (QUICK_SCENES if quick else CASES):
-        if name not in CASES:
-            raise unknown_name("scene", name, CASES)
-        place = PLACES[CASES[name]]
-        if place.missing:
-            rows.append({"scene": name, "skipped": place.missing})
-            continue
-        points, indices = load_triangles(place)
-        case = place.path().keys[0]
-        count = QUICK_RAYS if quick else RAYS
-        batches = {"diffuse": diffuse_rays(points, indices, count), "primary": primary_rays(case, count)}
-        rows += compare(name, points, indices, batches, device, 3 if quick else REPETITIONS)
+    for name in parts or (QUICK_SCENES if quick else CASES):
+        rows += attempt({"scene": name}, lambda name=name: scene_rows(name, quick, device))
     return rows
+
+
+def scene_rows(name: str, quick: bool, device: str) -> list[Row]:
+    """Return the rows of a scene."""
+    place = PLACES[CASES[name]]
+    if place.missing:
+        return [{"scene": name, "skipped": place.missing}]
+    points, indices = load_triangles(place)
+    count = QUICK_RAYS if quick else RAYS
+    rays = {"diffuse": diffuse_rays(points, indices, count), "primary": primary_rays(place.path().keys[0], count)}
+    return compare(name, points, indices, rays, device, 3 if quick else REPETITIONS)
 
 
 def compare(
@@ -84,6 +82,8 @@ def compare(
         launch.set_threads(1)
         tree, mesh, peers, row = build_all(name, points, indices, device, repetitions)
         rows = [row]
+        if not peers:
+            rows.append({"table": "builds", "scene": name, "skipped": NO_EMBREE})
         for kind, (origins, directions) in batches.items():
             for query in ("any", "closest"):
                 row = {"table": "rays", "scene": name, "triangles": len(indices), "rays": kind, "query": query}
@@ -99,37 +99,35 @@ def compare(
 def build_all(name: str, points: np.ndarray, indices: np.ndarray, device: str, repetitions: int) -> tuple:
     """Return our tree, a wp.Mesh, Embree's scenes by name, and the row of build times (CPU seconds)."""
     TriangleBvh(points, indices[:100], device)  # compiles
-    row, peak = {"table": "builds", "scene": name, "triangles": len(indices)}, PeakMemory()
+    row: Row = {"table": "builds", "scene": name, "triangles": len(indices)}
     builders: dict[str, Callable[[], object]] = {
         "ours": lambda: TriangleBvh(points, indices, device),
         "warp": lambda: warp_mesh(points, indices, device),
     }
-    try:
-        from embreex import mesh_construction, rtcore_scene
-    except ImportError:
-        row["skipped"] = "embreex is not installed: pip install embreex"
-    else:
-
-        def embree(robust: bool) -> tuple:
-            scene = rtcore_scene.EmbreeScene(robust=robust)
-            mesh = mesh_construction.TriangleMesh(scene, points, indices)
-            scene.run(points[:1], points[:1] + 1.0, query="OCCLUDED")  # commits
-            return scene, mesh
-
-        builders |= {name: partial(embree, robust) for name, robust in EMBREE.items()}
-    built = take_turns({name: _ignoring(build) for name, build in builders.items()}, min(repetitions, 3), device, 1)
+    with suppress(ImportError):
+        builders |= {name: embree_builder(points, indices, robust) for name, robust in EMBREE.items()}
+    turns = {name: _ignoring(build) for name, build in builders.items()}
+    built = take_turns(turns, min(repetitions, 3), device, 1, host=EMBREE)
     for key, taken in built.items():
-        row |= median_and_spread(f"{key} build s", _counting(key, taken))
+        row |= median_and_spread(f"{key} build s", taken.counting)
     for key in [name for name in EMBREE if name in built]:
         row |= ratio_and_spread(f"{key} / ours", built[key].cpu, built["ours"].counting)
     row["bytes a triangle"] = built["ours"].results[0].memory_bytes / len(indices)
     results = {key: taken.results[0] for key, taken in built.items()}
-    return results.pop("ours"), results.pop("warp"), results, row | peak.row()
+    return results.pop("ours"), results.pop("warp"), results, row
 
 
-def _counting(name: str, taken: Taken[Any]) -> list[float]:
-    """Return the seconds that count; Embree runs on the CPU whatever the device is."""
-    return taken.cpu if name in EMBREE else taken.counting
+def embree_builder(points: np.ndarray, indices: np.ndarray, robust: bool) -> Callable[[], tuple]:
+    """Return what builds Embree's scene and mesh; raises ImportError without embreex."""
+    from embreex import mesh_construction, rtcore_scene
+
+    def build() -> tuple:
+        scene = rtcore_scene.EmbreeScene(robust=robust)
+        mesh = mesh_construction.TriangleMesh(scene, points, indices)
+        scene.run(points[:1], points[:1] + 1.0, query="OCCLUDED")  # commits
+        return scene, mesh
+
+    return build
 
 
 def _ignoring(work: Callable[[], T]) -> Callable[[int], T]:
@@ -180,8 +178,9 @@ def race(
         return faces.numpy()
 
     runners["warp"] = warp_query
-    taken = take_turns({name: _ignoring(run) for name, run in runners.items()}, repetitions, device.alias, 1)
-    rates = {name: [len(origins) / seconds / 1e6 for seconds in _counting(name, one)] for name, one in taken.items()}
+    turns = {name: _ignoring(run) for name, run in runners.items()}
+    taken = take_turns(turns, repetitions, device.alias, 1, host=EMBREE)
+    rates = {name: [len(origins) / seconds / 1e6 for seconds in one.counting] for name, one in taken.items()}
     row: Row = {}
     for key, values in rates.items():
         row |= median_and_spread(f"{key} Mrays/s", values)
@@ -203,17 +202,16 @@ def trace(tree: TriangleBvh, query: str, origins: np.ndarray, directions: np.nda
 
 
 def scaling(tree: TriangleBvh, query: str, origins: np.ndarray, directions: np.ndarray, repetitions: int) -> Row:
-    """Return what two threads do to wall time (the best of each, as the machine may be shared) and to CPU time."""
-    best = {1: (np.inf, np.inf), 2: (np.inf, np.inf)}
-    for _ in range(repetitions):
-        for threads in best:
-            launch.set_threads(threads)
-            wall, cpu = time.perf_counter(), time.process_time()
-            trace(tree, query, origins, directions)
-            taken = time.perf_counter() - wall, time.process_time() - cpu
-            best[threads] = tuple(np.minimum(best[threads], taken).tolist())
+    """Return what two threads do to wall time and to CPU time."""
+
+    def with_threads(count: int, turn: int) -> None:
+        launch.set_threads(count)
+        trace(tree, query, origins, directions)
+
+    taken = take_turns({str(count): partial(with_threads, count) for count in (1, 2)}, repetitions)
     launch.set_threads(1)
-    return {"2 threads faster": best[1][0] / best[2][0], "2 threads cpu": best[2][1] / best[1][1]}
+    row = ratio_and_spread("2 threads faster", taken["1"].wall, taken["2"].wall)
+    return row | ratio_and_spread("2 threads cpu", taken["2"].cpu, taken["1"].cpu)
 
 
 @wp.kernel(enable_backward=False)
@@ -283,23 +281,3 @@ def primary_rays(case: CameraKey, count: int) -> tuple[np.ndarray, np.ndarray]:
     directions = forward + x[..., None] * right * side + y[..., None] * right * height / width * up
     directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).reshape(-1, 3).astype(np.float32)
     return np.tile(np.float32(case.eye), (len(directions), 1)), directions
-
-
-def main() -> None:
-    """Print the rows as tables and as lines of JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="three scenes, fewer rays")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--scenes", nargs="+", choices=list(CASES), help="all by default")
-    parser.add_argument("--json", type=Path, help="also write the lines of JSON here")
-    options = parser.parse_args()
-    rows = run(options.quick, options.device, options.scenes)
-    runner.print_rows("rays", rows)
-    for row in rows:
-        print(json.dumps(row))
-    if options.json:
-        runner.write_json_lines(options.json, "rays", rows, options.quick, options.device)
-
-
-if __name__ == "__main__":
-    main()

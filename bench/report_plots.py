@@ -126,11 +126,18 @@ def _plot(choice: Choice, rows: list[Row]) -> Plot:
         if row.get("table", "") != choice.table or any(row.get(key) != value for key, value in choice.only.items()):
             continue
         for column in choice.y:
+            column = _of_the_device(column, row)
             if column in row:
                 lines.setdefault(_line_name(choice, row, column), []).extend(_points(choice, row, column))
     series = {name: tuple(zip(*sorted(points), strict=True)) for name, points in lines.items() if len(points) > 1}
     y_label = ", ".join(choice.y) if choice.x != FRAME else "MSE / settled MSE"
     return Plot(choice.title, choice.x, y_label, series, choice.log_x, choice.log_y, choice.fit, choice.suite)
+
+
+def _of_the_device(column: str, row: Row) -> str:
+    """Return the column of a CUDA device's own seconds in place of the CPU's, if the row has one."""
+    on_device = column.replace("cpu", "device")
+    return on_device if on_device in row else column
 
 
 def _line_name(choice: Choice, row: Row, column: str) -> str:

@@ -11,7 +11,7 @@ from warp_gi.bench import markdown, records
 from warp_gi.bench.diff import SERIES, SPREADS
 from warp_gi.cli_report import cell_text
 
-LONGEST = 14
+LONGEST = 30
 """Rows that are shown without being asked for."""
 SHORTEST_SERIES = 6
 """Numbers in words that are drawn as a line."""

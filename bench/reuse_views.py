@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 import warp_gi as gi
-from warp_gi import launch
-from warp_gi.bench.measure import Row, Times, cost
+from warp_gi.bench.measure import Row, Times, cost, timed
 from warp_gi.bench.stages import Case
 
 MEASURED = ("emitters", "indirect", "beauty")
@@ -99,11 +97,8 @@ class FrameRun:
 
     def step(self, index: int, truth: Truth) -> None:
         """Render a frame and measure it."""
-        compiled, wall, cpu = launch.compile_seconds, time.perf_counter(), time.process_time()
-        self.frame = self.scheduler.frame(index)
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        compiled = launch.compile_seconds - compiled
-        self.times.append((wall - compiled, max(cpu - compiled, 0.0)))
+        self.frame, times = timed(lambda: self.scheduler.frame(index))
+        self.times.append(times)
         self.timings.append(dict(self.frame.timings))
         for term, error in truth.errors(self.frame).items():
             self.errors[term].append(error)

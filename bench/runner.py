@@ -14,7 +14,6 @@ import os
 import platform
 import subprocess
 import time
-import traceback
 from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 from importlib import metadata
@@ -23,7 +22,7 @@ from typing import Any
 
 from warp_gi import launch
 from warp_gi.bench.gallery import CLOSED, Gallery, call
-from warp_gi.bench.measure import PeakMemory
+from warp_gi.bench.measure import PeakMemory, attempt
 from warp_gi.cli_report import print_table
 from warp_gi.errors import unknown_name
 from warp_gi.files import replacing
@@ -46,18 +45,25 @@ def suites(folder: Path = FOLDER) -> dict[str, str]:
     return found
 
 
-def run_suite(name: str, quick: bool, device: str, gallery: Gallery = CLOSED) -> list[dict[str, Any]]:
+def run_suite(
+    name: str, quick: bool, device: str, gallery: Gallery = CLOSED, parts: Sequence[str] = ()
+) -> list[dict[str, Any]]:
     """Run a suite and return its rows, the last of them what it took in this process; pictures go to the gallery.
 
-    Raises OptionError if there is no suite of that name or no such device.
+    ``parts`` are names of the suite's ``PARTS``; none are all. Raises OptionError if there is no suite or part of that
+    name, or no such device.
     """
     if name not in (known := suites()):
         raise unknown_name("benchmark suite", name, known)
     launch.get_device(device)
-    run = importlib.import_module(f"warp_gi.bench.{name}").run
+    commit()  # of what runs, whatever is committed meanwhile
+    suite = importlib.import_module(f"warp_gi.bench.{name}")
+    for part in parts:
+        if part not in (known_parts := getattr(suite, "PARTS", {})):
+            raise unknown_name(f"part of suite {name}", part, known_parts)
     compiled, memory = launch.compile_seconds, PeakMemory()
     wall, cpu = time.perf_counter(), time.process_time()
-    rows = call(run, quick, device, gallery.of(name))
+    rows = call(suite.run, quick, device, gallery.of(name), **({"parts": parts} if parts else {}))
     whole = {"table": WHOLE, "wall s": time.perf_counter() - wall, "cpu s": time.process_time() - cpu}
     return [*rows, whole | {"compile s": launch.compile_seconds - compiled} | memory.row()]
 
@@ -69,13 +75,7 @@ def run_all(quick: bool, device: str, gallery: Gallery = CLOSED) -> Iterator[tup
     """
     launch.get_device(device)
     for name in suites():
-        try:
-            rows = run_suite(name, quick, device, gallery)
-        except Exception as error:  # whatever a suite does, the others go on
-            if os.environ.get("WARP_GI_DEBUG", "0") != "0":
-                traceback.print_exc()
-            rows = [{"failed": f"{type(error).__name__}: {' '.join(str(error).split())}"}]
-        yield name, rows
+        yield name, attempt({}, lambda name=name: run_suite(name, quick, device, gallery))
 
 
 def has_failed(rows: Iterable[dict[str, Any]]) -> bool:
@@ -135,10 +135,16 @@ def environment(device: str) -> dict[str, Any]:
     }
 
 
+@lru_cache
 def commit() -> str:
-    """Return the commit of the working tree, with "+" if it has changes, or "unknown" outside of one."""
-    arguments = ["git", "-C", str(FOLDER), "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+"]
-    return _printed(arguments) or "unknown"
+    """Return the commit of the working tree, with "+" if it has changes, as it was when this was first asked.
+
+    "unknown" outside of one, also where another project's tree holds this package.
+    """
+    git = ["git", "-C", str(FOLDER)]
+    if _printed([*git, "ls-files", "--error-unmatch", Path(__file__).name]) is None:
+        return "unknown"
+    return _printed([*git, "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+"]) or "unknown"
 
 
 def cpu_model() -> str:

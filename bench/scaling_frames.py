@@ -74,6 +74,8 @@ def light_rows_of(counts: Sequence[int], size: tuple[int, int], turns: int, devi
     for name in EMITTERS:
         said = {"table": "lights: growth", "estimator": name, "what": "frame cost s"}
         rows.append(said | Growth.of(counts, [taken[f"{name} {count}"].counting for count in counts]).row())
+        memory = [[row["lights MB"]] for row in rows if row.get("estimator") == name and "lights MB" in row]
+        rows.append(said | {"what": "lights MB"} | Growth.of(counts, memory).row())
     return rows
 
 

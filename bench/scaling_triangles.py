@@ -12,7 +12,7 @@ import numpy as np
 
 from warp_gi import launch
 from warp_gi.bench.measure import PeakMemory, Row, Taken, median_and_spread, ratio_and_spread, take_turns
-from warp_gi.bench.rays import diffuse_rays, primary_rays, trace
+from warp_gi.bench.rays import NO_EMBREE, diffuse_rays, embree_builder, primary_rays, trace
 from warp_gi.bench.scaling_fits import Growth
 from warp_gi.bench.scaling_mesh import CROWD_VIEW, crowd
 from warp_gi.bench.sequence import resident_memory
@@ -63,7 +63,7 @@ def rows_of(counts: Sequence[int], rays: int, turns: int, device: str, builds: i
     meshes = [build(count, rays, device, builds) for count in counts]
     rows = [mesh.row for mesh in meshes]
     if "embree" not in meshes[0].trees:
-        rows.append({"table": "triangles", "skipped": "embreex is not installed: pip install embreex"})
+        rows.append({"table": "triangles", "skipped": NO_EMBREE})
     return rows + build_growth(meshes) + ray_rows(meshes, turns, device)
 
 
@@ -78,19 +78,22 @@ def build(count: int, rays: int, device: str, builds: int) -> Mesh:
     def ours(_: int) -> TriangleBvh:
         before, peak = resident_memory(), PeakMemory()
         tree = TriangleBvh(points, indices, device)
-        peaks.append(peak.bytes - before)
+        if peak.is_anew:
+            peaks.append(peak.bytes - before)
         return tree
 
     builders: dict[str, Callable[[int], Any]] = {"ours": ours}
     with suppress(ImportError):
-        builders["embree"] = embree_builder(points, indices)
-    taken = take_turns(builders, builds, device, keep=1, warm=False)
+        commit = embree_builder(points, indices, robust=False)
+        builders["embree"] = lambda turn: commit()
+    taken = take_turns(builders, builds, device, keep=1, warm=False, host=("embree",))
     trees = {name: turns.results.pop() for name, turns in taken.items()}
     row: Row = {"table": "triangles", "triangles": len(indices)}
     for name, turns in taken.items():
         row |= turns.row("build " if name == "ours" else f"{name} build ")
     row["bytes a triangle"] = trees["ours"].memory_bytes / len(indices)
-    row["build peak GB"] = max(peaks) / 1e9
+    if peaks:
+        row["build peak GB"] = max(peaks) / 1e9
     return Mesh(len(indices), trees, batches_of(points, indices, rays), taken, row)
 
 
@@ -100,19 +103,6 @@ def batches_of(points: np.ndarray, indices: np.ndarray, rays: int) -> dict[str, 
     again = np.random.default_rng(0).integers(FEW, size=-(-rays // TIMES)).repeat(TIMES)[:rays]
     few = tuple(part[:FEW][again] for part in diffuse)
     return dict(zip(KINDS, (primary_rays(CROWD_VIEW, rays), diffuse, in_cells(*diffuse), few), strict=True))
-
-
-def embree_builder(points: np.ndarray, indices: np.ndarray) -> Callable[[int], tuple]:
-    """Return what builds Embree's scene of a mesh, in its fast mode; raises ImportError without embreex."""
-    from embreex import mesh_construction, rtcore_scene
-
-    def build(_: int) -> tuple:
-        scene = rtcore_scene.EmbreeScene(robust=False)
-        mesh = mesh_construction.TriangleMesh(scene, points, indices)
-        scene.run(points[:1], points[:1] + 1.0, query="OCCLUDED")  # commits
-        return scene, mesh
-
-    return build
 
 
 def in_cells(origins: np.ndarray, directions: np.ndarray, cells: int = 32) -> tuple[np.ndarray, np.ndarray]:
@@ -132,7 +122,11 @@ def build_growth(meshes: Sequence[Mesh]) -> list[Row]:
     counts, rows = [mesh.triangles for mesh in meshes], []
     for name in meshes[0].builds:
         said = {"table": "triangles: build growth", "renderer": name, "what": "build cost s"}
-        rows.append(said | Growth.of(counts, [counting(name, mesh.builds[name]) for mesh in meshes]).row())
+        rows.append(said | Growth.of(counts, [mesh.builds[name].counting for mesh in meshes]).row())
+    peaks = [[mesh.row["build peak GB"]] for mesh in meshes if "build peak GB" in mesh.row]
+    if len(peaks) == len(meshes):
+        said = {"table": "triangles: build growth", "renderer": "ours", "what": "build peak GB"}
+        rows.append(said | Growth.of(counts, peaks).row())
     most = max(mesh.row["bytes a triangle"] for mesh in meshes)
     return [*rows, {"table": "triangles: memory", "bytes a triangle": most, "target": MOST_BYTES}]
 
@@ -150,7 +144,7 @@ def ray_rows(meshes: Sequence[Mesh], turns: int, device: str) -> list[Row]:
             for i, mesh in enumerate(meshes):
                 here = {name: taken[f"{name} {i}"] for name in mesh.trees}
                 scale = 1e9 / len(mesh.batches[kind][0])
-                spent = {name: scale * np.array(counting(name, one)) for name, one in here.items()}
+                spent = {name: scale * np.array(one.counting) for name, one in here.items()}
                 for name, values in spent.items():
                     measured.setdefault((name, kind, query), []).append(values)
                 rows.append(ray_row(mesh, kind, query, spent) | agreement(query, here))
@@ -167,14 +161,9 @@ def race(meshes: Sequence[Mesh], kind: str, query: str, turns: int, device: str)
     before = launch.thread_count()
     try:
         launch.set_threads(1)
-        return take_turns(works, turns, device, keep=1)
+        return take_turns(works, turns, device, keep=1, host=[name for name in works if name.startswith("embree")])
     finally:
         launch.set_threads(before)
-
-
-def counting(name: str, taken: Taken) -> list[float]:
-    """Return the seconds that count; Embree runs on the CPU whatever the device is."""
-    return taken.cpu if name == "embree" else taken.counting
 
 
 def ray_row(mesh: Mesh, kind: str, query: str, spent: dict[str, np.ndarray]) -> Row:

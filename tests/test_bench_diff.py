@@ -23,9 +23,10 @@ def names(changes):
 
 LOWER = """wall s | paths ms | seconds | ns a pixel | wall s to 0.01 | MSE beauty | ours relMSE | RMSE | ST FLIP
     | error ratio | bytes a triangle | KB | peak GB | beauty / baseline | beauty, equal time | wrong per million
-    | bad pixels | device s | RMSE at equal time"""
+    | bad pixels | device s | RMSE at equal time | object kB | frames until settled | dark / lit"""
 HIGHER = """Mrays/s | Mrays/wall s | faster, cpu | speed-up | x | faster at equal error, cpu | agree | ratio cpu
-    | ours frames a minute | embree / ours | ours / embree | times mitsuba, wall"""
+    | ours frames a minute | ratio device | bake / raw, cpu | of tree
+    | embree / ours | ours / embree | times mitsuba, wall"""
 NEITHER = """blender frames a minute | mitsuba wall s | embree Mrays/s | paper's method, ratio cpu | leaves
     | paths spp for this RMSE | samples"""
 
@@ -86,9 +87,12 @@ def test_spreads_that_touch_are_no_change(spread):
     def with_spread(value, width):
         return row(**{"wall s": value, f"wall s {spread}": width})
 
-    assert diff.compare([with_spread(1.0, 0.3)], [with_spread(1.49, 0.2)]).worse == []
-    assert names(diff.compare([with_spread(1.0, 0.3)], [with_spread(1.51, 0.2)]).worse) == ["wall s"]
-    assert names(diff.compare([with_spread(1.0, 0.01)], [with_spread(1.03, 0.01)]).worse) == ["wall s"]  # below 15 %
+    assert diff.compare([with_spread(1.0, 0.3)], [with_spread(1.99, 0.2)]).worse == []
+    assert names(diff.compare([with_spread(1.0, 0.3)], [with_spread(2.01, 0.2)]).worse) == ["wall s"]
+    assert names(diff.compare([with_spread(1.0, 0.01)], [with_spread(1.05, 0.01)]).worse) == ["wall s"]  # below 15 %
+    assert diff.compare([with_spread(1.0, 0.0)], [with_spread(1.02, 0.0)]).worse == []
+    quick = [with_spread(value, 0.0) | {"quick": True} for value in (1.0, 1.14, 1.16)]
+    assert diff.compare(quick[:1], quick[1:2]).worse == [] and len(diff.compare(quick[:1], quick[2:]).worse) == 1
     assert names(diff.compare([with_spread(1.0, 0.3)], [row(**{"wall s": 1.2})]).worse) == ["wall s"]  # not in both
     assert diff.compare([with_spread(1.0, 0.3)], [with_spread(1.0, 9.0)]).changed == []  # spreads are no values
 

@@ -10,7 +10,7 @@ import warp as wp
 
 import warp_gi as gi
 from warp_gi import launch, metrics
-from warp_gi.bench import measure, mitsuba_peer, path, presets, scatter
+from warp_gi.bench import gallery, measure, mitsuba_peer, path, presets, scatter
 from warp_gi.bench.places import PLACES
 
 # ---- time ----
@@ -152,3 +152,43 @@ def test_mitsuba_is_the_same_in_both_variants():
     error = (np.var(llvm, ddof=1) / 4 + np.var(scalar, ddof=1) / 4) ** 0.5
     assert abs(llvm.mean() - scalar.mean()) < 5 * error + 1e-3 * llvm.mean()
     assert pictures[0].shape == (4, 16, 24, 3)
+
+
+# ---- apart from the rest ----
+
+
+def test_peers_on_the_host_have_no_device_seconds(monkeypatch):
+    asked = []
+    monkeypatch.setattr(measure, "clocked", lambda work, device: (asked.append(device), (1.0, 1.0), None))
+    measure.take_turns({"a": lambda index: None, "peer": lambda index: None}, 1, "cuda", host=("peer",))
+    assert asked == ["cuda", "cpu"]
+
+
+def test_a_part_that_fails_is_a_row_and_the_rest_goes_on():
+    def fails():
+        raise RuntimeError("out of\nluck")
+
+    assert measure.attempt({"case": "a"}, fails) == [{"case": "a", "failed": "RuntimeError: out of luck"}]
+    assert measure.attempt({"case": "a"}, lambda: [{"x": 1}]) == [{"x": 1}]
+    parts = {"one": lambda quick, device: fails(), "two": lambda quick, device: [{"quick": quick}]}
+    rows = gallery.run_parts(parts, (), True, "cpu", gallery.CLOSED)
+    assert rows == [{"part": "one", "failed": "RuntimeError: out of luck"}, {"quick": True}]
+    assert gallery.run_parts(parts, ["two"], False, "cpu", gallery.CLOSED) == [{"quick": False}]
+
+
+def test_a_process_has_our_threads_and_says_why_it_failed(tmp_path, monkeypatch):
+    (tmp_path / "said.py").write_text(
+        "import json, os, sys\n"
+        "print('first'), print(json.dumps({k: os.environ.get(k) for k in ('WARP_GI_THREADS', 'GIVEN')}))\n"
+        "if sys.argv[1:]: print('a line'), sys.exit(sys.argv[1])\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(launch, "_threads", 3)
+    assert measure.in_process(["said"], GIVEN="yes") == {"WARP_GI_THREADS": "3", "GIVEN": "yes"}
+    assert measure.in_process(["said", "no luck"]) == {"failed": "no luck"}
+
+
+def test_mitsuba_takes_no_punctual_lights():
+    scene = gi.Scene(gi.builtin_scene("cornell_box").nodes, [gi.PunctualLight("point", (1.0, 1.0, 1.0), (0, 1, 0))])
+    with pytest.raises(ValueError, match="punctual lights are not converted"):
+        mitsuba_peer.to_mitsuba(scene, PLACES["cornell_box"].camera())

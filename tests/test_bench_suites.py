@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -63,7 +65,10 @@ def test_a_sequence_is_rendered_and_measured():
     found = sequence.measure("cornell_box", ("--denoise", "spatiotemporal"), SMALL, "cpu")
     rows = sequence.rows_of("path", found, SMALL)
     speed, stages, memory, *series = rows
-    assert speed["frames a minute"] == pytest.approx(360 / speed["wall s"]) and speed["peak GB"] > 0.05
+    assert (
+        speed["frames a minute"] == pytest.approx(360 / (speed["wall s"] - stages["compile s"]))
+        and speed["peak GB"] > 0.05
+    )
     assert speed["s a frame"] > 0 and speed["s a frame spread"] >= 0
     for column in ("start s", "load s", "compile s", "trace s a frame", "denoise s a frame", "write s a frame"):
         assert stages[column] > 0, column
@@ -265,6 +270,30 @@ def test_a_part_that_failed_is_exit_code_1(monkeypatch, capsys):
     assert capsys.readouterr().err == "failed: one\n" * 2
     rows.pop()
     assert [cli.main(["bench", name]) for name in ("one", "all")] == [0, 0]
+
+
+def test_parts_of_a_suite_are_chosen_by_name(monkeypatch, capsys):
+    monkeypatch.setitem(reuse.PARTS, "cost", lambda quick, device: [{"case": "a", "quick": quick}])
+    assert cli.main(["bench", "reuse", "--parts", "cost", "--quick", "--json", "-"]) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]  # lines alone
+    assert [row.get("case") for row in rows] == ["a", None] and rows[1]["table"] == "run"
+    for arguments, message in (
+        (["reuse", "--parts", "csot"], "unknown part of suite reuse 'csot'; did you mean 'cost'"),
+        (["compile", "--parts", "cost"], "unknown part of suite compile"),
+        (["all", "--parts", "cost"], "--parts is for one SUITE"),
+        (["--quick"], "for a SUITE to run"),
+        (["--quick", "compare"], "compare comes first"),
+    ):
+        assert cli.main(["bench", *arguments]) == 2
+        said = capsys.readouterr().err
+        assert message in said and len(said.splitlines()) == 1
+
+
+def test_the_commit_is_of_our_own_tree(monkeypatch, tmp_path):
+    runner.commit.cache_clear()
+    monkeypatch.setattr(runner, "_printed", lambda arguments: None if "ls-files" in arguments else "another's")
+    assert runner.commit() == "unknown"
+    runner.commit.cache_clear()
 
 
 def test_all_keeps_what_was_measured_before_an_interrupt(tmp_path, monkeypatch, capsys):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import warp_gi as gi
-from warp_gi.bench import presets, rays
+from warp_gi.bench import presets, rays, runner
 from warp_gi.bench.places import PLACES
 
 
@@ -57,4 +57,4 @@ def test_missing_scenes_give_a_row_and_unknown_ones_an_error(monkeypatch, tmp_pa
     assert all("WARP_GI_SCENES" in row["skipped"] for row in rows[:2])
     assert all(row["triangles"] == gi.builtin_scene("cornell_box").triangle_count for row in rows[2:])
     with pytest.raises(gi.OptionError, match="did you mean 'sponza'"):
-        rays.run(scenes=["sponsa"])
+        runner.run_suite("rays", True, "cpu", parts=["sponsa"])

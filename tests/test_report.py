@@ -36,7 +36,7 @@ LONG = [
     {"suite": "long", **ENVIRONMENT, "table": "over frames", "frame of a sequence": f"a frame of number {i}"}
     | {f"column {k}": 1.0 + k for k in range(9)}
     | {"wall s": w, "wall s spread": 0.05}
-    for i, w in enumerate([9.0, 12345.0, 6.1, *np.arange(20.0, 32.0)])
+    for i, w in enumerate([9.0, 12345.0, 6.1, *np.arange(20.0, 48.0)])
 ] + [{"suite": "long", **ENVIRONMENT, "table": "learning", "case": "a", "MSE by frame": SERIES}]
 
 
@@ -162,7 +162,7 @@ def test_spreads_stand_beside_their_values(tmp_path):
 
 def test_long_tables_are_folded(tmp_path):
     text = html_of(tmp_path, LONG)
-    assert text.count("<details") == 1 and "<summary>15 rows</summary>" in text
+    assert text.count("<details") == 1 and "<summary>31 rows</summary>" in text
     assert "<details" not in html_of(tmp_path, LONG[1:])
 
 

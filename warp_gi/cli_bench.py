@@ -32,6 +32,8 @@ class Bench:
 
     suite: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SUITE", help_behavior_hint="")] = ""
     """One that warp-gi bench lists, or all."""
+    parts: Annotated[tuple[str, ...], flag("NAME...", "all of them")] = ()
+    """Parts of the suite to run; a wrong name tells which there are."""
     quick: bool = False
     """Smaller inputs, for a first look; not for figures that anyone quotes."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
@@ -77,6 +79,12 @@ def _check(options: Bench) -> None:
         raise OptionError("--tolerance is for --diff OLD NEW")
     if options.report and (options.suite or options.json):
         raise OptionError("--report runs nothing: give it results files and --html FILE, without SUITE or --json")
+    if options.parts and options.suite in ("", ALL):
+        raise OptionError("--parts is for one SUITE; give its name")
+    if not options.suite and (options.quick or options.threads is not None or options.device != "cpu"):
+        raise OptionError("--quick, --device and --threads are for a SUITE to run; give its name")
+    if options.suite == "compare":
+        raise OptionError("compare comes first and has options of its own: warp-gi bench compare --help")
     if options.report and options.html is None:
         raise OptionError("--report needs --html FILE, to write the report to")
     if (options.html or options.json) and not (options.suite or options.report):
@@ -90,8 +98,9 @@ def _run(options: Bench) -> int:
     """Run a suite; 1 if a part of it failed."""
     _start(options)
     gallery = Gallery(is_open=options.html is not None)
-    rows = runner.run_suite(options.suite, options.quick, options.device, gallery)
-    runner.print_rows(options.suite, rows)
+    rows = runner.run_suite(options.suite, options.quick, options.device, gallery, options.parts)
+    if options.json != Path("-"):
+        runner.print_rows(options.suite, rows)
     if options.json == Path("-"):
         print(runner.json_lines(options.suite, rows, options.quick, options.device), end="")
     elif options.json is not None:
@@ -117,7 +126,8 @@ def _run_all(options: Bench) -> int:
     for suite, found in runner.run_all(options.quick, options.device, gallery):
         rows += runner.stamped(suite, found, options.quick, options.device)
         failed += [suite] * runner.has_failed(found)
-        runner.print_rows(suite, found)
+        if options.json != Path("-"):
+            runner.print_rows(suite, found)
         if options.json == Path("-"):
             print(runner.json_lines(suite, found, options.quick, options.device), end="")
         elif options.json is not None:
