@@ -10,51 +10,72 @@ from warp_gi.bench.publish_techniques import DENOISERS, DVF, PROBES, REUSE
 _PICTURES = (
     "Sponza, white sky, depth 4",
     "living room, lamp, depth 4",
+    "living room, lamp, direct",
     "Sponza, white sky, direct",
     "living room, white sky, direct",
     "Sponza, courtyard sky, direct",
+    "atrium, its sky and lamps, depth 4",
+    "Cornell box, emitters, direct",
 )
-_ATRIUM, _SPONZA = "first frame of atrium", "first frame of crytek_sponza.glb"
-_COLD = (f"{_ATRIUM}, cold kernel cache", f"{_SPONZA}, cold kernel cache")
-_WARM = (f"{_ATRIUM}, warm kernel cache", f"{_SPONZA}, warm kernel cache")
+_LLVM, _SCALAR = "mitsuba llvm_ad_rgb", "mitsuba scalar_rgb"
+
+
+def _seconds(renderer: str) -> Figure:
+    return Figure("wall s", {"renderer": renderer}, table="equal samples")
+
+
+def _faster(header: str, key: str, peer: str) -> Column:
+    return Column(header, Figure(key, {"peer": peer}, 3, at_least=1.0))
+
+
+def _first(scene: str | tuple[str, ...], state: str) -> Figure:
+    """Return the seconds to the first frame of a scene, or of several."""
+    scenes = (scene,) if isinstance(scene, str) else scene
+    only = {"case": tuple(f"first frame of {name}, {state} kernel cache" for name in scenes)}
+    return Figure("wall s", only, table="first frame")
+
 
 _PATH = Region(
     "path",
     (
         Text(
             "Pictures of {pixels} with {spp} samples a pixel:",
-            {"pixels": Figure("pixels", {"case": _PICTURES}), "spp": Figure("spp", {"case": _PICTURES})},
+            {k: Figure(k) for k in ("pixels", "spp")},
+            "equal samples",
         ),
         Grid(
             "picture",
             {case: {"case": case} for case in _PICTURES},
             (
-                Column("ours, s", Figure("ours wall s")),
-                Column("Mitsuba, s", Figure("mitsuba wall s")),
-                Column("faster", Figure("faster, wall", digits=3, at_least=1.0)),
-                Column("faster at equal error", Figure("faster at equal error, cpu", digits=3, at_least=1.0)),
-                Column("mean off Mitsuba's, %", Figure("means differ", scale=100.0)),
+                Column("ours, s", _seconds("ours")),
+                Column("Mitsuba LLVM, s", _seconds(_LLVM)),
+                _faster("faster, wall", "faster, wall", _LLVM),
+                _faster("at equal error, CPU", "faster at equal error, cpu", _LLVM),
+                _faster("than scalar at equal error, CPU", "faster at equal error, cpu", _SCALAR),
+                Column("mean off Mitsuba's, %", Figure("means differ", {"peer": _LLVM}, scale=100.0)),
             ),
+            "beside peers",
         ),
         Text(
             "From the shell to the first finished frame of {pixels} at {spp} samples: Sponza {sponza} s, the atrium "
             "{atrium} s; {cold} s while kernels compile for the first time. Bistro at {large} peaks at {memory} GB.",
             {
-                "pixels": Figure("pixels", {"case": _COLD + _WARM}),
-                "spp": Figure("spp", {"case": _COLD + _WARM}),
-                "sponza": Figure("wall s", {"case": f"{_SPONZA}, warm kernel cache"}),
-                "atrium": Figure("wall s", {"case": f"{_ATRIUM}, warm kernel cache"}),
-                "cold": Figure("wall s", {"case": _COLD}),
-                "large": Figure("pixels", {"case": "Bistro at 960x540"}),
-                "memory": Figure("peak GB", {"case": "Bistro at 960x540"}),
+                "pixels": Figure("pixels"),
+                "spp": Figure("spp"),
+                "sponza": _first("crytek_sponza.glb", "warm"),
+                "atrium": _first("atrium", "warm"),
+                "cold": _first(("crytek_sponza.glb", "atrium"), "cold"),
+                "large": Figure("pixels", table="memory"),
+                "memory": Figure("peak GB", table="memory"),
             },
+            "first frame",
         ),
     ),
 )
 
 # ---- rays ----
 
-_MESHES = {"Living room": "living room", "Sponza": "sponza", "Bistro": "bistro", "Dragon": "dragon"}
+_MESHES = {name.capitalize(): name for name in ("living room", "sponza", "bistro", "dragon", "atrium", "street")}
 
 
 def _hits(query: str) -> tuple[Column, ...]:
@@ -78,6 +99,7 @@ _RAYS = Region(
                 for rays in ("diffuse", "primary")
             },
             (*_hits("any"), *_hits("closest")),
+            "rays",
         ),
         Text(
             "{warp} times Warp's own queries; {threads} times as fast on two threads. Building takes {build} s where "
@@ -87,11 +109,12 @@ _RAYS = Region(
             {
                 "warp": Figure("ours / warp"),
                 "threads": Figure("2 threads faster", digits=3),
-                "build": Figure("ours build s"),
-                "embree": Figure("embree build s"),
-                "bytes": Figure("bytes a triangle"),
+                "build": Figure("ours build s", table="builds"),
+                "embree": Figure("embree build s", table="builds"),
+                "bytes": Figure("bytes a triangle", table="builds"),
                 "order": Figure("in order / embree", {"scene": ("bistro", "dragon"), "rays": "diffuse"}, 3),
             },
+            "rays",
         ),
     ),
 )
@@ -156,6 +179,49 @@ _SEQUENCE = Region(
     ),
 )
 
+# ---- scaling ----
+
+_GROWTH, _BUILD = "growth for ten times", "build cost s"
+
+_SCALING = Region(
+    "scaling",
+    (
+        Grid(
+            "rays, query",
+            {
+                f"{rays}, {query} hit": {"rays": rays, "query": query}
+                for rays in ("primary", "diffuse", "diffuse, sorted", "diffuse, few")
+                for query in ("any", "closest")
+            },
+            (
+                Column("exponent", Figure("exponent", {"renderer": "ours"})),
+                Column("ten times the triangles", Figure(_GROWTH, {"renderer": "ours"}, 3, at_most="target")),
+                Column("exponent, Embree", Figure("exponent", {"renderer": "embree"})),
+                Column("ten times, Embree", Figure(_GROWTH, {"renderer": "embree"}, 3)),
+            ),
+            "triangles: growth",
+        ),
+        Text(
+            "Wanted were {target} times for ten times the triangles, and at most {most} bytes for each: it is {bytes}. "
+            "Exponents of the time to build {build} (Embree {embree}), of a frame over the number of lights {lights}, "
+            "over pixels {pixels}; of bakes over samples {samples}. {threads} threads render {faster} times as fast.",
+            {
+                "target": Figure("target", {"renderer": "ours"}),
+                "most": Figure("target", table="triangles: memory", digits=3),
+                "bytes": Figure("bytes a triangle", table="triangles: memory"),
+                "build": Figure("exponent", {"renderer": "ours", "what": _BUILD}, table="triangles: build growth"),
+                "embree": Figure("exponent", {"renderer": "embree", "what": _BUILD}, table="triangles: build growth"),
+                "lights": Figure("exponent", {"what": "frame cost s"}, table="lights: growth"),
+                "pixels": Figure("exponent", {"what": "frame cost s"}, table="pixels: growth"),
+                "samples": Figure("exponent", {"what": "bake cost s"}, table="bake samples: growth"),
+                "threads": Figure("threads used", {"work": "path-traced frame", "threads used": 2}, table="threads"),
+                "faster": Figure("speed-up", {"work": "path-traced frame", "threads used": 2}, 3, table="threads"),
+            },
+            "triangles: growth",
+        ),
+    ),
+)
+
 REGIONS = {
     "path": _PATH,
     "rays": _RAYS,
@@ -165,4 +231,5 @@ REGIONS = {
     "reuse": REUSE,
     "compile": _COMPILE,
     "sequence": _SEQUENCE,
+    "scaling": _SCALING,
 }
