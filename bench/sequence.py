@@ -102,7 +102,7 @@ def rows_of(name: str, found: dict[str, Any], size: Size) -> list[Row]:
         return [{"table": "speed", "pipeline": name, "failed": found["failed"]}]
     settings = {"pixels": size.pixels, "spp": size.spp, "frames": size.frames}
     said: Row = {"pipeline": name, **settings}
-    seconds = found["wall s"] - found["once"].get("compile s", 0.0)  # what the kernel cache held is no matter of the sequence
+    seconds = found["wall s"] - found["once"].get("compile s", 0.0)  # the kernel cache held it or not
     speed = {"frames a minute": 60 * size.frames / seconds, "wall s": found["wall s"]}
     speed |= {"cpu s": found["cpu s"], **median_and_spread("s a frame", found["frames"]), "peak GB": found["peak GB"]}
     stages = {"start s": found["wall s"] - found["inside s"], **found["once"], **found["a frame"]}
