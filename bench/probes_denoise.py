@@ -60,7 +60,8 @@ def pipeline_rows(
             try:
                 scheduler = gi.FrameScheduler(scene, path, few, device, seed=1, bakes=bakes)
             except OptionError as missing:
-                rows.append({"table": "denoise", "case": name, "denoiser": denoiser, "skipped": str(missing)})
+                said: Row = {"table": "denoise", "case": name, "pipeline": label, "skipped": str(missing)}
+                rows += [said] if said not in rows else []
                 continue
             seconds = []
             for index in range(FRAME + 1):

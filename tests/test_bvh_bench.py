@@ -19,6 +19,8 @@ def test_rows_hold_every_contender_and_all_agree():
         "primary": rays.primary_rays(gi.CameraKey(0.0, (0.5, 0.5, 3.0), (0.5, 0.5, 0.5), hfov=40.0), 6000),
     }
     build, *races = rays.compare("soup", points, indices, batches, repetitions=1)
+    has_peer = "skipped" not in races[0]
+    races = races if has_peer else races[1:]
     assert build["triangles"] == 300 and build["ours build s"] > 0.0 and build["bytes a triangle"] > 0.0
     assert [(row["rays"], row["query"]) for row in races] == [
         ("diffuse", "any"),
@@ -28,7 +30,7 @@ def test_rows_hold_every_contender_and_all_agree():
     ]
     for row in races:
         assert row["ours Mrays/s"] > 0.0 and row["ours in order Mrays/s"] > 0.0 and row["ours / warp"] > 0.0
-        if "skipped" not in build:
+        if has_peer:
             assert row["agree"] > 0.999 and row["ours / embree"] > 0.0 and row["ours / embree robust"] > 0.0
 
 
@@ -53,7 +55,9 @@ def test_missing_scenes_give_a_row_and_unknown_ones_an_error(monkeypatch, tmp_pa
     monkeypatch.setitem(rays.CASES, "box", "cornell_box")
     monkeypatch.setattr(rays, "QUICK_SCENES", ("living room", "sponza", "box"))
     rows = rays.run(quick=True)
-    assert [row["scene"] for row in rows] == ["living room", "sponza", *["box"] * 5]
+    missing = [row for row in rows if row.get("skipped") == rays.NO_EMBREE]  # where it is not installed
+    rows = [row for row in rows if row not in missing]
+    assert [row["scene"] for row in rows] == ["living room", "sponza", *["box"] * 5] and len(missing) <= 1
     assert all("WARP_GI_SCENES" in row["skipped"] for row in rows[:2])
     assert all(row["triangles"] == gi.builtin_scene("cornell_box").triangle_count for row in rows[2:])
     with pytest.raises(gi.OptionError, match="did you mean 'sponza'"):
