@@ -105,7 +105,8 @@ def clocked(work: Callable[[], T], device: str = "cpu") -> tuple[T, Times, float
     found = launch.get_device(device)
     events = [wp.Event(found, enable_timing=True) for _ in range(2)] if found.is_cuda else []
     wp.synchronize()
-    compiled, wall, cpu = launch.compile_seconds, time.perf_counter(), time.process_time()
+    compiled, wall = launch.compile_seconds, time.perf_counter()
+    compiled_cpu, cpu = launch.compile_cpu_seconds, time.process_time()
     if events:
         found.stream.record_event(events[0])
     result = work()
@@ -113,9 +114,9 @@ def clocked(work: Callable[[], T], device: str = "cpu") -> tuple[T, Times, float
         found.stream.record_event(events[1])
     wp.synchronize()
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    compiled = launch.compile_seconds - compiled
+    compiled, compiled_cpu = launch.compile_seconds - compiled, launch.compile_cpu_seconds - compiled_cpu
     on_device = max(wp.get_event_elapsed_time(*events) / 1e3 - compiled, 0.0) if events else None
-    return result, (wall - compiled, max(cpu - compiled, 0.0)), on_device
+    return result, (wall - compiled, cpu - compiled_cpu), on_device
 
 
 def timed(work: Callable[[], T]) -> tuple[T, Times]:

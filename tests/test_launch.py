@@ -1,5 +1,8 @@
 """The launcher: slices, threads, and the checks that Warp does not make."""
 
+import time
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -92,3 +95,11 @@ def test_thread_count_from_the_environment(monkeypatch):
 def test_missing_device_names_the_ones_there():
     with pytest.raises(OptionError, match="cpu"):
         launch.get_device("cuda:99")
+
+
+def test_loading_is_timed_on_the_wall_and_the_cores(monkeypatch):
+    for name in ("compile_seconds", "compile_cpu_seconds"):
+        monkeypatch.setattr(launch, name, 0.0)
+    module = SimpleNamespace(name="slow", load=lambda device, block: (time.sleep(0.2), sum(range(10**6))))
+    launch.load(SimpleNamespace(module=module), CPU)
+    assert launch.compile_seconds > launch.compile_cpu_seconds + 0.1 and launch.compile_cpu_seconds > 0

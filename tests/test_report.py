@@ -563,7 +563,7 @@ def test_nothing_overflows_a_narrow_page(browser, long_report):
         for summary in page.locator("summary").all():
             if not summary.evaluate("s => s.parentNode.open"):
                 summary.click()
-        page.wait_for_function("document.querySelectorAll('.viewer[data-ready]').length === 3")
+        page.locator(".viewer[data-ready]").nth(2).wait_for()
         assert page.evaluate("document.scrollingElement.scrollWidth") <= 400
         scroller = page.locator(".fold .table")
         assert scroller.evaluate("e => e.scrollWidth > e.clientWidth && e.getBoundingClientRect().right <= 400")
@@ -581,7 +581,7 @@ def test_pictures_are_unpacked_when_they_are_opened(browser, long_report):
         page.wait_for_timeout(200)
         assert page.evaluate(ready) == [True, False, False]
         page.locator(".case > summary").nth(1).click()
-        page.wait_for_function(f"{ready}[1]")
+        page.locator(".viewer[data-ready]").nth(1).wait_for()
         assert page.evaluate(ready) == [True, True, False]
 
 
