@@ -1,5 +1,6 @@
 """The command line, as a user meets it."""
 
+import ctypes
 import json
 import os
 import shutil
@@ -417,3 +418,32 @@ def test_suites_are_modules_with_run(tmp_path):
     (tmp_path / "helper.py").write_text('"""Helps."""\ndef other():\n    pass\n')
     assert runner.suites(Path(tmp_path)) == {"speed": "Measures speed."}
     assert "runner" not in runner.suites()
+
+
+HEAP = """
+import ctypes
+import warp as wp
+from warp_gi.cli_report import start_warp
+
+class Heap(ctypes.Structure):
+    _fields_ = [(n, ctypes.c_size_t) for n in "arena count fast mapped mapped_bytes a b used free top".split()]
+
+start_warp()
+told = ctypes.CDLL(None).mallinfo2
+told.restype = Heap
+large = wp.zeros(30_000_000, dtype=wp.uint8, device="cpu")
+del large  # after this the library would keep what is smaller
+before = told()
+arrays = [wp.zeros(size, dtype=wp.uint8, device="cpu") for size in (4_000_000, 2_000_000)]
+print(told().mapped_bytes - before.mapped_bytes, told().arena - before.arena)
+"""
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallinfo2"), reason="needs the heap of glibc 2.33 or newer")
+@pytest.mark.parametrize("told", [False, True])
+def test_large_arrays_do_not_live_in_the_heap(told):
+    """Where they leave holes; unless whoever starts the process has set it otherwise."""
+    environment = os.environ | ({"MALLOC_MMAP_THRESHOLD_": "33554432"} if told else {})
+    found = subprocess.run([sys.executable, "-c", HEAP], capture_output=True, text=True, env=environment, check=True)
+    mapped, heap = map(int, found.stdout.split())
+    assert mapped < 1e5 if told else (mapped > 6e6 and heap < 1e5), found.stdout
