@@ -22,6 +22,8 @@ from warp_gi.files import replacing
 
 ROOT = runner.FOLDER.parent
 PAGE, README = Path("docs/results.md"), Path("README.md")
+DEVICE = "cpu"
+"""Of the figures in the README; the page has all."""
 REGION = re.compile(r"(<!-- results: (?P<name>[^\n]*?) -->\n)(?P<text>.*?)(?P<end><!-- end -->|\Z)", re.DOTALL)
 
 
@@ -48,7 +50,11 @@ def pages(root: Path) -> dict[Path, str]:
     for suite, found in records.environments(rows).items():
         if len({one.get("quick", False) for one in found}) > 1:
             raise OptionError(f"{root / 'bench/results'}: quick and full runs of suite {suite!r}; keep the full ones")
-    return {PAGE: page(rows), README: readme((root / README).read_text(encoding="utf-8"), rows)}
+        on_cpu = {(one.get("cpu"), one.get("threads")) for one in found if one.get("device") == DEVICE}
+        if len(on_cpu) > 1:
+            raise OptionError(f"{root / 'bench/results'}: suite {suite!r} ran on several processors; keep one's")
+    told = [row for row in rows if row.get("device", DEVICE) == DEVICE]
+    return {PAGE: page(rows), README: readme((root / README).read_text(encoding="utf-8"), told)}
 
 
 def publish(root: Path, check: bool = False) -> list[Path]:

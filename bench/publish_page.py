@@ -22,12 +22,12 @@ Columns = dict[str, list[Any]]
 
 def page(rows: Sequence[records.Row]) -> str:
     """Return the page: for each suite the hardware and commit that it was measured with, and its tables."""
-    parts = list(HEAD)
+    parts, rows = list(HEAD), records.machines_apart(rows)
     measures, environments, suite = runner.suites(), records.environments(rows), None
     for table in sorted(records.tables_of(rows), key=lambda table: table.suite):
         if table.suite != suite:
             suite = table.suite
-            parts += [f"## {suite}", measures.get(suite, "")]
+            parts += [f"## {suite}", measures.get(suite.split(", machine")[0], "")]
             parts.append("\n".join(f"- {records.environment_text(one)}" for one in environments.get(suite, [])))
         if table.name:
             parts.append(f"### {table.name}" + (" (the paper's own figures)" if table.is_quoted else ""))

@@ -12,6 +12,8 @@ from warp_gi.bench.runner import ENVIRONMENT
 from warp_gi.errors import OptionError
 
 Row = dict[str, Any]
+MACHINE = ("cpu", "cores", "threads", "device", "quick")
+"""What must be the same of figures that stand in one table; commits and versions may differ from part to part."""
 
 
 def read(paths: Iterable[Path]) -> list[Row]:
@@ -87,6 +89,28 @@ def environments(rows: Iterable[Row]) -> dict[str, list[Row]]:
         if here and here not in known:
             known.append(here)
     return found
+
+
+def machines_apart(rows: Iterable[Row]) -> list[Row]:
+    """Return rows as they are, but for those of a suite that ran on several machines, or quick and in full.
+
+    Their key "suite" becomes "rays, machine 1", "rays, machine 2", ... in the order of their first rows.
+    """
+    rows, known = list(rows), dict[str, list[Row]]()
+    for row in rows:
+        found = known.setdefault(str(row.get("suite", "")), [])
+        if _machine(row) not in found:
+            found.append(_machine(row))
+    parted = []
+    for row in rows:
+        found = known[suite := str(row.get("suite", ""))]
+        where = f"machine {found.index(_machine(row)) + 1}"
+        parted.append(row | {"suite": f"{suite}, {where}" if suite else where} if len(found) > 1 else row)
+    return parted
+
+
+def _machine(row: Row) -> Row:
+    return {key: row[key] for key in MACHINE if key in row}
 
 
 def environment_text(environment: Row) -> str:

@@ -291,8 +291,10 @@ def test_a_pipeline_that_cannot_be_set_up_is_a_row(monkeypatch, capsys, tmp_path
     fails = lambda name, *more: ({"failed": "no memory"}, []) if name == "dvf" else real(name, *more)  # noqa: E731
     monkeypatch.setattr(compare_setup, "setup_of", fails)
     arguments = [*SMALL, "--pipelines", "dvf,direct", "--time", "0.1s", "--reference-spp", "2", "--json", "-"]
-    assert cli.main(["bench", "compare", *arguments]) == 0
-    rows = [json.loads(text) for text in capsys.readouterr().out.splitlines()]
+    assert cli.main(["bench", "compare", *arguments]) == 1
+    printed = capsys.readouterr()
+    assert printed.err == "failed: dvf\n"
+    rows = [json.loads(text) for text in printed.out.splitlines()]
     assert [row["pipeline"] for row in rows if "failed" in row] == ["dvf"]
     assert {row["pipeline"] for row in rows if row["table"] == "equal time"} == {"direct"}
     arguments[arguments.index("dvf,direct")] = "dvf"

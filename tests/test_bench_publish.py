@@ -120,6 +120,25 @@ def test_results_that_are_missing(root):
         publish.publish(root)
 
 
+def test_the_readme_has_the_processor_s_figures_and_the_page_both(root):
+    on_gpu = [row | {"device": "cuda"} | {key: 77.0 for key in row if key.endswith(" s")} for row in ROWS[:3]]
+    path = root / "bench/results/path.jsonl"
+    (root / "bench/results/path_cuda.jsonl").write_text("".join(json.dumps(row) + "\n" for row in on_gpu))
+    path.write_text("".join(json.dumps(row | {"device": "cpu"}) + "\n" for row in ROWS), encoding="utf-8")
+    text = publish.pages(root)
+    assert "77" not in text[publish.README] and "| 10 |" in text[publish.README]
+    parts = text[publish.PAGE].split("\n## ")
+    assert [part.partition("\n")[0] for part in parts[1:]] == ["other", "path, machine 1", "path, machine 2"]
+    assert (
+        ["77" in part for part in parts[2:]] == [False, True]
+        and SUITES["path"] in parts[2]
+        and SUITES["path"] in parts[3]
+    )
+    (root / "bench/results/more.jsonl").write_text(json.dumps(ROWS[0] | {"device": "cpu", "cpu": "B"}) + "\n")
+    with pytest.raises(gi.OptionError, match="suite 'path' ran on several processors"):
+        publish.publish(root)
+
+
 def test_results_without_a_region_s_column_end_in_one_line(root, monkeypatch, capsys):
     monkeypatch.setattr(publish, "ROOT", root)
     (root / "bench/results/path.jsonl").write_text(json.dumps(ROWS[0]) + "\n", encoding="utf-8")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
 import os
 import re
 import shutil
@@ -276,6 +277,27 @@ def test_report_of_results_files_runs_nothing(tmp_path, capsys, monkeypatch):
     assert "r.html" in capsys.readouterr().out
     text = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert len(Cells(text).tables[0]) == 5 and "Rays a second over triangles" in text
+
+
+def test_what_two_machines_measured_stands_apart(tmp_path):
+    row = {"suite": "rays", "table": "rays", "rays": "diffuse", "query": "any", "triangles": 10, "ours Mrays/s": 1.0}
+    small = ENVIRONMENT | {"commit": "4567def"}  # another commit on the same machine
+    rows = [row | ENVIRONMENT, row | small | {"triangles": 20}]
+    rows += [row | ENVIRONMENT | {"cpu": "Other CPU", "triangles": count} for count in (10, 20)]
+    rows += [{"suite": "path", **ENVIRONMENT, "case": "alone"}]
+    files = [tmp_path / name for name in ("a.jsonl", "b.jsonl")]
+    for file, part in zip(files, (rows[:2], rows[2:]), strict=True):
+        file.write_text("".join(json.dumps(one) + "\n" for one in part), encoding="utf-8")
+    assert cli.main(["bench", "--report", *map(str, files), "--html", str(tmp_path / "r.html")]) == 0
+    text = (tmp_path / "r.html").read_text(encoding="utf-8")
+    headings = re.findall("<h2>(.*?)</h2>", text)
+    assert headings == ["rays, machine 1", "rays, machine 2", "path"] and "<title>warp_gi: rays, path</title>" in text
+    assert [len(table) for table in Cells(text).tables] == [3, 3, 2]
+    first, second, _ = text.split("<h2>")[1:]
+    for part, machine, commits in ((first, "Some CPU", 2), (second, "Other CPU", 1)):
+        assert "Rays a second over triangles" in part and part.count(machine) == commits
+    assert records.machines_apart(rows[:2]) == rows[:2]
+    assert [one["suite"] for one in records.machines_apart([{"cpu": "A"}, {"cpu": "B"}])] == ["machine 1", "machine 2"]
 
 
 def test_a_suite_writes_its_report(tmp_path, monkeypatch, capsys):

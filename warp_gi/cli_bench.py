@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -109,11 +109,11 @@ def _run(options: Bench) -> int:
     if options.html is not None:
         stamped = runner.stamped(options.suite, rows, options.quick, options.device)
         write_html(options.html, stamped, gallery.sets, quiet=options.json == Path("-"))
-    return _told([options.suite] if runner.has_failed(rows) else [])
+    return exit_code([options.suite] if runner.has_failed(rows) else [])
 
 
-def _told(failed: Sequence[str]) -> int:
-    """Say which suites failed, and return the exit code."""
+def exit_code(failed: Sequence[str]) -> int:
+    """Say which suites or pipelines failed, and return 1 if any did."""
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return 1 if failed else 0
@@ -136,7 +136,7 @@ def _run_all(options: Bench) -> int:
         print(f"rows: {options.json}")
     if options.html is not None:
         write_html(options.html, rows, gallery.sets, quiet=options.json == Path("-"))
-    return _told(failed)
+    return exit_code(failed)
 
 
 def _start(options: Bench) -> None:
@@ -149,14 +149,22 @@ def _start(options: Bench) -> None:
 
 
 def write_html(path: Path, rows: list[records.Row], pictures: Sequence[PictureSet] = (), quiet: bool = False) -> None:
-    """Write a report of stamped rows, with the plots that they allow; raises OSError."""
+    """Write a report of stamped rows, with the plots that they allow; raises OSError.
+
+    What different machines measured is kept apart.
+    """
     from warp_gi.bench import report, report_plots
 
-    by_suite: dict[str, list[records.Row]] = {}
-    for row in rows:
-        by_suite.setdefault(str(row.get("suite", "")), []).append(row)
-    plots = [plot for suite, group in by_suite.items() for plot in report_plots.plots_of(suite, group)]
-    suites = ", ".join(filter(None, by_suite))
+    apart = records.machines_apart(rows)
+    groups: dict[tuple[str, str], list[records.Row]] = {}
+    for row, shown in zip(rows, apart, strict=True):
+        groups.setdefault((str(row.get("suite", "")), str(shown.get("suite", ""))), []).append(row)
+    plots = [
+        replace(plot, suite=shown)
+        for (suite, shown), group in groups.items()
+        for plot in report_plots.plots_of(suite, group)
+    ]
+    rows, suites = apart, ", ".join(dict.fromkeys(suite for suite, _ in groups if suite))
     report.write_report(path, f"warp_gi: {suites}" if suites else "warp_gi", rows, pictures, plots)
     if not quiet:
         print(f"report: {path}")

@@ -17,7 +17,7 @@ from warp_gi.baking import Bake
 from warp_gi.bench import compare, compare_reference, compare_rows, compare_setup, records, runner
 from warp_gi.bench.gallery import PictureSet
 from warp_gi.camera import Camera, CameraPath
-from warp_gi.cli_bench import write_html
+from warp_gi.cli_bench import exit_code, write_html
 from warp_gi.cli_inputs import DEFAULT_SCENE, SceneOptions, find_camera, find_scene, parse_resolution
 from warp_gi.cli_options import flag, parse_options
 from warp_gi.cli_render import BAKE_SUFFIX, pipeline_named
@@ -108,7 +108,7 @@ def main(arguments: Sequence[str]) -> int:
         found = compare.take_turns(runs, reference, limit, told)
     rows = [_scene_row(options, given, limit), *compare_rows.rows_of(found, limit, setups)]
     _write(options, rows, found, limit)
-    return 0
+    return exit_code([name for name in setups if name not in bakes])
 
 
 def parse(arguments: Sequence[str]) -> CompareBench:
