@@ -8,9 +8,10 @@ import sys
 import tempfile
 import time
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import numpy as np
 
 from warp_gi import launch
 from warp_gi.bench import blender_peer
+from warp_gi.bench.gallery import CLOSED, run_parts
 from warp_gi.bench.measure import Row, in_process, median_and_spread, peak_memory
 from warp_gi.bench.places import PLACES
 from warp_gi.cli_report import Reporter, start_warp
@@ -30,11 +32,9 @@ CASES: dict[str, tuple[str, ...]] = {
     "reuse": ("--pipeline", "reuse"),
     "path, denoised": ("--pipeline", "path", "--denoise", "spatiotemporal"),
 }
-QUICK: dict[str, tuple[str, ...]] = {
-    "path": CASES["path"],
-    "probes, 4x4x4 of 64x64": (*CASES["probes"], "--indirect.counts", "4", "4", "4", "--indirect.resolution", "64"),
-    "reuse": CASES["reuse"],
-}
+SMALLER: dict[str, tuple[str, ...]] = {"probes": ("--indirect.counts", "4", "4", "4", "--indirect.resolution", "64")}
+"""What the quick form adds, as its frames are too few to pay for a bake."""
+SMALLER_TITLE = "4x4x4 of 64x64"
 MOST_POINTS = 20
 STAGES = ("preprocess", "trace", "denoise", "write")
 _OTHERS = ("bake", "compile")
@@ -53,13 +53,28 @@ class Size:
 FULL_SIZE, QUICK_SIZE = Size(500, "160x90", 4), Size(12, "160x90", 4)
 
 
-def run(quick: bool = False, device: str = "cpu") -> list[Row]:
+def pipeline_rows(name: str, quick: bool, device: str) -> list[Row]:
+    """Return rows of speed, stages and memory of a case."""
+    size, smaller = (QUICK_SIZE, SMALLER.get(name, ())) if quick else (FULL_SIZE, ())
+    title = f"{name}, {SMALLER_TITLE}" if smaller else name
+    return rows_of(title, measure(SCENE, (*CASES[name], *smaller), size, device), size)
+
+
+def cycles_rows(quick: bool, device: str) -> list[Row]:
+    """Return rows of Blender Cycles beside our path tracer; both run on the processor."""
+    return blender_peer.rows(blender_peer.QUICK if quick else blender_peer.FULL)
+
+
+PARTS: dict[str, Callable[..., list[Row]]] = {
+    **{name.split()[-1]: partial(pipeline_rows, name) for name in CASES},
+    "cycles": cycles_rows,
+}
+QUICK_PARTS = ("path", "probes", "reuse", "cycles")
+
+
+def run(quick: bool = False, device: str = "cpu", parts: Sequence[str] = ()) -> list[Row]:
     """Return rows of speed, stages and memory for each pipeline, and of Blender Cycles beside the first."""
-    size = QUICK_SIZE if quick else FULL_SIZE
-    rows: list[Row] = []
-    for name, arguments in (QUICK if quick else CASES).items():
-        rows += rows_of(name, measure(SCENE, arguments, size, device), size)
-    return rows + blender_peer.rows(blender_peer.QUICK if quick else blender_peer.FULL)
+    return run_parts(PARTS, parts or (QUICK_PARTS if quick else ()), quick, device, CLOSED)
 
 
 # ---- one sequence ----

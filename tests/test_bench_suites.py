@@ -84,6 +84,26 @@ def test_a_sequence_that_fails_is_a_row():
     assert "unknown pipeline 'pth'" in row["failed"]
 
 
+def test_a_sequence_has_a_part_for_each_pipeline(monkeypatch):
+    asked = []
+
+    def measure(scene, arguments, size, device):
+        asked.append((arguments, size))
+        return {"failed": "asked alone"}
+
+    monkeypatch.setattr(sequence, "measure", measure)
+    monkeypatch.setattr(sequence.blender_peer, "rows", lambda job: [{"job": job}])
+    assert [row["pipeline"] for row in sequence.run(False)[:-1]] == list(sequence.CASES)
+    assert [size for _, size in asked] == [sequence.FULL_SIZE] * 5
+    asked.clear()
+    *ours, theirs = sequence.run(True)
+    assert [row["pipeline"] for row in ours] == ["path", "probes, 4x4x4 of 64x64", "reuse"]
+    assert theirs == {"job": sequence.blender_peer.QUICK} and "64" in asked[1][0]
+    assert {size for _, size in asked} == {sequence.QUICK_SIZE}
+    (row,) = sequence.run(False, parts=["denoised"])
+    assert row["pipeline"] == "path, denoised"
+
+
 def test_memory_growth_is_a_least_squares_line():
     line = 100 + 0.5 * np.arange(40)
     assert sequence.slope(line)["KB a frame"] == pytest.approx(500)
