@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from warp_gi import cli, sequence
-from warp_gi.cli_render import stoppable
+from warp_gi.cli_options import value_given
+from warp_gi.cli_render import Render, parse, stoppable
 from warp_gi.cli_report import Reporter
 from warp_gi.preview import write_png
 
@@ -356,6 +357,47 @@ def test_version_and_no_command(capsys):
     assert cli.main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("warp-gi 0.")
     assert cli.main([]) == 2
+
+
+def test_render_without_arguments_is_the_default_sequence():
+    assert parse([]) == Render(preview=True)
+    assert parse(["--no-preview"]) == Render() and parse(["street"]) == Render(scene="street")
+
+
+@pytest.mark.parametrize("command", ["info", "compare"])
+def test_a_command_without_arguments_says_what_it_needs(command, capsys):
+    assert cli.main([command]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("warp-gi: error: Missing from") and said.count("\n") == 1
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--ssp", "3"], "Unrecognized options: --ssp, 3; did you mean --spp? (see warp-gi render --help)"),
+        (["--spp"], "Missing value for argument '--spp'. Expected 1 values (see warp-gi render --help)"),
+        (["--nope"], "Unrecognized options: --nope (see warp-gi render --help)"),
+    ],
+)
+def test_mistyped_options_are_one_line_in_every_encoding(encoding, arguments, message):
+    result = run("render", *arguments, env=os.environ | {"PYTHONIOENCODING": encoding})
+    assert (result.returncode, result.stdout, result.stderr) == (2, "", f"warp-gi: error: {message}\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "value"),
+    [
+        ([], None),
+        (["--spp", "4"], None),
+        (["--bake", "a", "--spp", "4"], "a"),
+        (["--bake=a", "b"], "a"),
+        (["--bake", "a", "--bake=b"], "b"),
+        (["x", "--bake"], None),
+    ],
+)
+def test_the_value_of_a_flag_read_ahead(arguments, value):
+    assert value_given(arguments, "--bake") == value
 
 
 def test_compare(unbroken, tmp_path, capsys):

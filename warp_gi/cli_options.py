@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import re
 from collections.abc import Sequence
 from typing import Any, TypeVar
@@ -23,7 +24,7 @@ def flag(metavar: str, default: str, *aliases: str) -> object:
 def value_given(arguments: Sequence[str], name: str) -> str | None:
     """Return the value of the flag ``name``, the last one if there are several; None if there is none."""
     value = None
-    for argument, after in zip(arguments, [*arguments[1:], None], strict=True):
+    for argument, after in itertools.zip_longest(arguments, arguments[1:]):
         flag_name, equals, own = argument.partition("=")
         if flag_name == name:
             value = own if equals else after
@@ -46,12 +47,14 @@ def parse_options(options: type[Options], command: str, arguments: Sequence[str]
 
 
 def _one_line(report: str, command: str) -> str:
-    """Return what tyro's framed report says: its first part, and the first suggestion if it makes one."""
-    parts = [
-        " ".join(line.strip("│ ").strip() for line in part.splitlines() if line.strip("│╭╰╮╯─ ")).strip()
-        for part in re.split(r"│ ─+ │", re.sub(r"╭─.*─╮|╰─+╯", "", report))
-    ]
-    message = re.sub(r"\s+", " ", parts[0]).rstrip(". ")
-    suggestion = next((match for part in parts if (match := re.search(r"Perhaps you meant: (--[\w.-]+)", part))), None)
+    """Return what tyro's framed report says: its first part, and the first suggestion if it makes one.
+
+    Where stdout does not take lines that are not ASCII, the frame is hyphens, with the title as a part of its own.
+    """
+    lines = [line.strip("│ ") for line in report.splitlines() if not line.startswith(("╭", "╰"))]
+    parts = [part for part in re.split(r"^[─-]{3,}$", "\n".join(lines), flags=re.MULTILINE) if part.strip()]
+    told = parts[1:] if len(parts) > 1 and "╭" not in report else parts
+    message = re.sub(r"\s+", " ", told[0]).strip(". ") if told else "options that cannot be read"
+    suggestion = re.search(r"Perhaps you meant:\s+(--[\w.-]+)", "\n".join(told))
     hint = f"; did you mean {suggestion.group(1)}?" if suggestion else ""
     return f"{message}{hint} (see warp-gi {command} --help)"
