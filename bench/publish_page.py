@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
-from warp_gi.bench import diff, markdown, records, runner
-from warp_gi.cli_report import cell_text
+from warp_gi.bench import markdown, records, runner
+from warp_gi.bench.tables import shown
 
 MOST_COLUMNS = 12
 """Of a table; one with more is parted."""
@@ -17,7 +16,6 @@ HEAD = (
     "Median ± half the range of the middle half, where that was measured. Of a series over frames the first value, the "
     "last and their number; `warp-gi bench --report bench/results/*.jsonl --html FILE` plots it.",
 )
-Columns = dict[str, list[Any]]
 
 
 def page(rows: Sequence[records.Row]) -> str:
@@ -37,47 +35,14 @@ def page(rows: Sequence[records.Row]) -> str:
 
 def _tables(table: records.Table) -> list[str]:
     """Return a table of results as Markdown: what all rows say in a line, and one table or more of the rest."""
-    columns: Columns = {name: [row[i] for row in table.rows] for i, name in enumerate(table.columns)}
-    names = _identity(table)
-    shared = [name for name in names[1:] if len(table.rows) > 1 and len(set(columns[name])) == 1]
-    said = ", ".join(f"{name} {cell_text(columns.pop(name)[0])}" for name in shared)
-    numeric = {name for name, values in columns.items() if any(records.is_number(value) for value in values)}
-    columns = {name: [_short(value) for value in values] for name, values in _with_spreads(columns).items()}
+    one = shown(table)
     parts = [
-        markdown.table(part, list(zip(*(columns[name] for name in part), strict=True)), [n in numeric for n in part])
-        for part in _parted(list(columns), [name for name in names if name not in shared])
+        markdown.table(
+            part, list(zip(*(one.columns[name] for name in part), strict=True)), [name in one.numeric for name in part]
+        )
+        for part in _parted(list(one.columns), one.names)
     ]
-    return [f"In all rows: {said}.", *parts] if said else parts
-
-
-def _identity(table: records.Table) -> list[str]:
-    """Return the columns that tell what a row is of."""
-    found = {key for row in table.rows for key, _ in diff.identity_of(dict(zip(table.columns, row, strict=True)))}
-    return [name for name in table.columns if name in found] or list(table.columns[:1])
-
-
-def _with_spreads(columns: Columns) -> Columns:
-    """Return columns without those of spreads, which stand beside the values that they are of."""
-    merged, spreads = {}, {f"{name} spread" for name in columns}
-    for name, values in columns.items():
-        if of_this := columns.get(f"{name} spread"):
-            merged[name] = [_with_spread(*pair) for pair in zip(values, of_this, strict=True)]
-        elif name not in spreads:
-            merged[name] = values
-    return merged
-
-
-def _with_spread(value: Any, spread: Any) -> Any:
-    both = records.is_number(value) and records.is_number(spread)
-    return markdown.with_spread(value, spread) if both else value
-
-
-def _short(value: Any) -> Any:
-    """Return a value, or of a series of numbers in words the first, the last and the count."""
-    if isinstance(value, str) and diff.SERIES.fullmatch(value.strip()):
-        series = value.split()
-        return f"{series[0]} … {series[-1]} ({len(series)})"
-    return value
+    return [one.said, *parts] if one.said else parts
 
 
 def _parted(columns: list[str], names: list[str]) -> list[list[str]]:

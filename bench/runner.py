@@ -23,7 +23,6 @@ from typing import Any
 from warp_gi import launch
 from warp_gi.bench.gallery import CLOSED, Gallery, call
 from warp_gi.bench.measure import PeakMemory, attempt
-from warp_gi.cli_report import print_table
 from warp_gi.errors import unknown_name
 from warp_gi.files import replacing
 
@@ -81,15 +80,6 @@ def run_all(quick: bool, device: str, gallery: Gallery = CLOSED) -> Iterator[tup
 def has_failed(rows: Iterable[dict[str, Any]]) -> bool:
     """Return whether a row says that something failed."""
     return any("failed" in row for row in rows)
-
-
-def print_rows(title: str, rows: Sequence[dict[str, Any]]) -> None:
-    """Print rows as tables, one for each set of keys."""
-    tables: dict[tuple[str, ...], list[dict[str, Any]]] = {}
-    for row in rows:
-        tables.setdefault(tuple(row), []).append(row)
-    for columns, group in tables.items():
-        print_table(title, columns, [list(row.values()) for row in group])
 
 
 def json_lines(suite: str, rows: Sequence[dict[str, Any]], quick: bool, device: str) -> str:

@@ -12,11 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from warp_gi import cli, sequence
 from warp_gi.cli_options import value_given
 from warp_gi.cli_render import Render, parse, stoppable
-from warp_gi.cli_report import Reporter
+from warp_gi.cli_report import LOG_WIDTH, Reporter, print_table
 from warp_gi.preview import write_png
 
 SMALL = ["cornell_box", "--resolution", "24x16", "--spp", "4"]
@@ -441,16 +442,49 @@ def test_info(capsys):
     assert all(word in printed for word in ("triangles", "36", "lowest corner", "materials", "cameras", "memory"))
 
 
-def test_bench_rows_as_json_lines(tmp_path, capsys):
+def test_bench_rows_as_json_lines(tmp_path):
     from warp_gi.bench import runner
 
     rows = [{"case": "a", "seconds": 1.5}, {"case": "b", "seconds": np.float32(2)}, {"other": 1}]
-    runner.print_rows("suite", rows)
-    assert capsys.readouterr().out.count("suite") == 2  # two sets of keys, two tables
     runner.write_json_lines(tmp_path / "r.jsonl", "suite", rows, True, "cpu")
     lines = [json.loads(line) for line in (tmp_path / "r.jsonl").read_text().splitlines()]
     assert [line.get("seconds") for line in lines] == [1.5, 2.0, None]
     assert all({"commit", "cpu", "warp-lang", "device", "quick", "suite"} <= set(line) for line in lines)
+
+
+WIDE = {f"number {i}": 1234.5 + i for i in range(40)}
+
+
+def test_a_table_wider_than_a_line_is_parted_and_no_number_broken(capsys):
+    print_table("head", ["case", "spp", *WIDE], [["long_name", 4, *WIDE.values()], ["b", 16, *WIDE.values()]], [0, 1])
+    lines = capsys.readouterr().out.splitlines()
+    assert all(len(line) <= LOG_WIDTH for line in lines) and lines[1].startswith("head")
+    heads = [line.split() for line in lines if "spp" in line]
+    assert len(heads) == 2 and all(words[:2] == ["case", "spp"] for words in heads)
+    bodies = [line.split() for line in lines if line.startswith(" long_name")]
+    assert [word for words in bodies for word in words[2:]] == [f"{value:.4g}" for value in WIDE.values()]
+    assert abs(len(bodies[0]) - len(bodies[1])) <= 1
+
+
+def test_a_table_that_fits_is_left_whole(capsys):
+    few = dict(list(WIDE.items())[:12])
+    print_table("head", ["case", *few], [["a", *few.values()]])
+    assert capsys.readouterr().out.count("case") == 1
+
+
+def test_names_that_fill_a_line_are_columns_as_others(capsys):
+    names = [f"name{i}" for i in range(12)]
+    print_table("head", [*names, "x", "y"], [[*(letter * 20 for letter in "abcdefghijkl"), 1, 2]], range(12))
+    words = capsys.readouterr().out.split()
+    assert {*names, "x", "y", "1", "2", *(letter * 20 for letter in "abcdefghijkl")} <= set(words)
+    assert words.count("name0") == 2 and words.count("name11") == 1
+
+
+def test_output_that_cannot_be_encoded_is_replaced(tmp_path):
+    scene = tmp_path / "é±.ply"
+    trimesh.creation.box().export(scene)
+    result = run("info", scene.name, cwd=tmp_path, env=os.environ | {"PYTHONIOENCODING": "ascii"})
+    assert result.returncode == 0 and "??.ply" in result.stdout and "triangles" in result.stdout
 
 
 def test_suites_are_modules_with_run(tmp_path):

@@ -12,7 +12,7 @@ from typing import Annotated
 import tyro
 
 from warp_gi import launch
-from warp_gi.bench import diff, records, runner
+from warp_gi.bench import diff, records, runner, tables
 from warp_gi.bench.gallery import Gallery, PictureSet
 from warp_gi.cli_options import flag, parse_options
 from warp_gi.cli_report import print_table, start_warp
@@ -100,7 +100,7 @@ def _run(options: Bench) -> int:
     gallery = Gallery(is_open=options.html is not None)
     rows = runner.run_suite(options.suite, options.quick, options.device, gallery, options.parts)
     if options.json != Path("-"):
-        runner.print_rows(options.suite, rows)
+        tables.print_rows(options.suite, rows)
     if options.json == Path("-"):
         print(runner.json_lines(options.suite, rows, options.quick, options.device), end="")
     elif options.json is not None:
@@ -127,7 +127,7 @@ def _run_all(options: Bench) -> int:
         rows += runner.stamped(suite, found, options.quick, options.device)
         failed += [suite] * runner.has_failed(found)
         if options.json != Path("-"):
-            runner.print_rows(suite, found)
+            tables.print_rows(suite, found)
         if options.json == Path("-"):
             print(runner.json_lines(suite, found, options.quick, options.device), end="")
         elif options.json is not None:

@@ -14,14 +14,14 @@ import numpy as np
 
 from warp_gi import launch
 from warp_gi.baking import Bake
-from warp_gi.bench import compare, compare_reference, compare_rows, compare_setup, records, runner
+from warp_gi.bench import compare, compare_reference, compare_rows, compare_setup, records, runner, tables
 from warp_gi.bench.gallery import PictureSet
 from warp_gi.camera import Camera, CameraPath
 from warp_gi.cli_bench import exit_code, write_html
 from warp_gi.cli_inputs import DEFAULT_SCENE, SceneOptions, find_camera, find_scene, parse_resolution
 from warp_gi.cli_options import flag, parse_options
 from warp_gi.cli_render import BAKE_SUFFIX, pipeline_named
-from warp_gi.cli_report import Reporter, print_table, start_warp
+from warp_gi.cli_report import Reporter, start_warp
 from warp_gi.errors import OptionError, check_whole
 from warp_gi.files import check_writable
 from warp_gi.pipeline import MOST_SAMPLES, Pipeline
@@ -216,8 +216,7 @@ def _write(options: CompareBench, rows: list[records.Row], found: compare.Compar
     if options.json == Path("-"):
         print(runner.json_lines(NAME, rows, False, options.device), end="")
     else:
-        for table in records.tables_of(row for row in rows if row["table"] != compare_rows.SERIES):
-            print_table(table.name, table.columns, table.rows)
+        tables.print_rows("", [row for row in rows if row["table"] != compare_rows.SERIES])
     if options.json is not None and options.json != Path("-"):
         runner.write_json_lines(options.json, NAME, rows, False, options.device)
         print(f"rows: {options.json}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import sys
 import time
@@ -15,6 +16,8 @@ import warp as wp
 from warp_gi import launch
 
 LINE_SECONDS = 10.0
+LOG_WIDTH, LONGEST_WORD, GAP = 200, 24, 3
+"""Characters of a table's line where no terminal limits it, of a word in one that is not broken, between columns."""
 _M_MMAP_THRESHOLD = -3
 _LARGE_BLOCK = 1 << 20
 
@@ -155,22 +158,64 @@ class Reporter:
             print_table(title, columns, rows)
 
 
-def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Print a table on standard output, plain enough for a log file."""
+def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]], names: Sequence[int] = (0,)) -> None:
+    """Print a table on standard output, plain enough for a log file.
+
+    One that is wider than the terminal, or than ``LOG_WIDTH`` elsewhere, is parted, so that no number is broken; each
+    part begins with the columns ``names``, as far as these fill half of a line.
+    """
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
     rows = [[cell_text(value) for value in row] for row in rows]
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for index, column in enumerate(columns):
-        numeric = any(_is_number(row[index]) for row in rows)
-        table.add_column(column, justify="right" if numeric else "left", overflow="fold")
-    for row in rows:
-        table.add_row(*row)
-    print(f"\n{title}", end="")
-    width = None if sys.stdout.isatty() else 200
-    Console(width=width, markup=False, highlight=False, emoji=False).print(table)
+    cells = [[row[index] for row in rows] for index in range(len(columns))]
+    numeric = [any(map(_is_number, column)) for column in cells]
+    widths = [_least_width(*one) for one in zip(columns, cells, numeric, strict=True)]
+    console = Console(width=None if sys.stdout.isatty() else LOG_WIDTH, markup=False, highlight=False, emoji=False)
+    parts = []
+    for part in _parts(widths, names, console.width):
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+        room = console.width - sum(widths[index] + GAP for index in part)
+        for index in part:
+            more = max(min(max(map(len, (columns[index], *cells[index]))) - widths[index], room), 0)
+            room -= more
+            justify = "right" if numeric[index] else "left"
+            table.add_column(columns[index], justify=justify, overflow="fold", width=widths[index] + more)
+        for row in rows:
+            table.add_row(*(row[index] for index in part))
+        with console.capture() as printed:
+            console.print(table)
+        parts.append("\n".join(line.rstrip() for line in printed.get().splitlines() if line.strip()))
+    print(f"\n{title}", "\n\n".join(parts), sep="\n")
+
+
+def _least_width(column: str, cells: Sequence[str], is_numeric: bool) -> int:
+    """Return how narrow a column may be: words stay whole, and numbers with what stands beside them."""
+    words = [column.split(), *([cell] if is_numeric else cell.split() for cell in cells)]
+    return max((min(len(word), LONGEST_WORD) for line in words for word in line), default=1)
+
+
+def _parts(widths: Sequence[int], names: Sequence[int], limit: int) -> list[list[int]]:
+    """Return a table's columns: in one part if they fit, else in parts alike in width that begin with ``names``."""
+    spaced = [width + GAP for width in widths]
+    if sum(spaced) <= limit:
+        return [list(range(len(widths)))]
+    names = [index for place, index in enumerate(names) if sum(spaced[i] for i in names[: place + 1]) <= limit / 2]
+    rest = [index for index in range(len(widths)) if index not in names]
+    begin = sum(spaced[index] for index in names)
+    total = sum(spaced[index] for index in rest)
+    count = max(math.ceil(total / max(limit - begin, 1)), 1)
+    parts: list[list[int]] = []
+    used = done = 0
+    for index in rest:
+        if done >= total * len(parts) / count or used + spaced[index] > limit:
+            parts.append([*names])
+            used = begin
+        parts[-1].append(index)
+        used += spaced[index]
+        done += spaced[index]
+    return parts or [[*names]]
 
 
 def start_warp(device: str = "cpu") -> None:
