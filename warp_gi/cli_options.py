@@ -54,7 +54,7 @@ def _one_line(report: str, command: str) -> str:
     lines = [line.strip("│ ") for line in report.splitlines() if not line.startswith(("╭", "╰"))]
     parts = [part for part in re.split(r"^[─-]{3,}$", "\n".join(lines), flags=re.MULTILINE) if part.strip()]
     told = parts[1:] if len(parts) > 1 and "╭" not in report else parts
-    message = re.sub(r"\s+", " ", told[0]).strip(". ") if told else "options that cannot be read"
+    message = re.sub(r"\s+", " ", told[0]).strip().rstrip(". ") if told else "options that cannot be read"
     suggestion = re.search(r"Perhaps you meant:\s+(--[\w.-]+)", "\n".join(told))
     hint = f"; did you mean {suggestion.group(1)}?" if suggestion else ""
     return f"{message}{hint} (see warp-gi {command} --help)"
