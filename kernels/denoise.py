@@ -19,7 +19,7 @@ LEAST_WEIGHT = wp.constant(wp.float32(1.0e-2))  # of history: less is a neighbou
 @wp.struct
 class Guides:
     guide_diffuse: wp.array(dtype=wp.vec3)  # diffuse albedo
-    guide_specular: wp.array(dtype=wp.vec3)  # average Fresnel reflectance
+    guide_specular: wp.array(dtype=wp.vec3)  # what the glossy lobe reflects of light from everywhere
     guide_distance: wp.array(dtype=wp.float32)  # metres from the camera, along the ray
     guide_position: wp.array(dtype=wp.vec3)
     guide_previous: wp.array(dtype=wp.vec3)  # where that point was in the previous frame

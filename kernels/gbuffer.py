@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_gi.kernels.bsdf import average_fresnel
+from warp_gi.kernels.bsdf import average_specular
 from warp_gi.kernels.bvh import bvh_intersect
 from warp_gi.kernels.environment import environment_radiance
 from warp_gi.kernels.sampling import filter_offset, pixel_sample_index, pixel_seed, sample_2d
@@ -147,7 +147,7 @@ def add_guides(
 ):
     normal = shading_normal(s)
     buffers.guide_diffuse[pixel] = buffers.guide_diffuse[pixel] + s.bsdf.diffuse
-    buffers.guide_specular[pixel] = buffers.guide_specular[pixel] + average_fresnel(s.bsdf)
+    buffers.guide_specular[pixel] = buffers.guide_specular[pixel] + average_specular(s.bsdf)
     if buffers.guide_object[pixel] == 0:
         buffers.guide_distance[pixel] = t
         buffers.guide_position[pixel] = s.position

@@ -5,7 +5,7 @@ What probes hold is reflected light; what a ray sees of the sky and of emitters 
 
 import warp as wp
 
-from warp_gi.kernels.bsdf import BsdfSample, average_fresnel, bsdf_sample, fresnel, specular_sample
+from warp_gi.kernels.bsdf import BsdfSample, average_specular, bsdf_sample, diffuse_share, fresnel, specular_sample
 from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, primary_direction, tiled_pixel
 from warp_gi.kernels.light_field import (
     NOTHING,
@@ -90,10 +90,9 @@ def steady_light(field: LightField, s: Surface, mode: wp.int32) -> Lobes:
         return r
     normal = shading_normal(s)
     arriving = irradiance_at(field, s.position, normal) / wp.pi
-    f = average_fresnel(s.bsdf)
-    r.diffuse = wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - f, arriving)
+    r.diffuse = wp.cw_mul(diffuse_share(s.bsdf), arriving)
     if mode == MODE_IRRADIANCE:
-        r.glossy = wp.cw_mul(f, arriving)
+        r.glossy = wp.cw_mul(average_specular(s.bsdf), arriving)
     return r
 
 
