@@ -22,6 +22,7 @@ PROBE_COVERED = wp.constant(1)  # inside of something: left out
 MOMENT_REACH = wp.constant(wp.float32(2.0))  # diagonals of a cage; moments count no distance as more
 WEIGHT_FLOOR = wp.constant(wp.float32(1.0e-3))
 COSINE_FLOOR = wp.constant(wp.float32(1.0e-3))
+OUTSIDE = wp.constant(wp.float32(1.0))  # distances between probes
 SURFEL_TOLERANCE = wp.constant(wp.float32(8.0))  # texels; about 1.5 degrees at 256
 
 _LARGEST_HALF = wp.constant(wp.float32(65504.0))
@@ -237,10 +238,10 @@ def surfel_visibility(field: LightField, probe: wp.int32, point: wp.vec3, distan
     return wp.clamp(2.0 - behind / tolerance, 0.0, 1.0)
 
 
-# Weight of the probe at a corner of the cage for a point with a normal, before normalisation: trilinear, cosine
-# towards the probe, visibility (section 5.2). `at` is the point in units of the grid.
+# Weight of the probe at a corner of the cage for a point with a normal, whether it sees the point or not: trilinear,
+# times the cosine towards the probe (section 5.2). `at` is the point in units of the grid.
 @wp.func
-def corner_weight(
+def blend_weight(
     field: LightField, cage: wp.vec3i, corner: wp.int32, at: wp.vec3, position: wp.vec3, normal: wp.vec3
 ) -> wp.float32:
     weight = float(1.0)
@@ -260,17 +261,34 @@ def corner_weight(
         return weight
     cosine = wp.dot(to_probe, normal) / distance
     # a probe in the way of no ray but at the far end of the cage still counts where no nearer one sees the point
-    weight = (weight + WEIGHT_FLOOR) * wp.max(cosine, COSINE_FLOOR)
+    return (weight + WEIGHT_FLOOR) * wp.max(cosine, COSINE_FLOOR)
+
+
+# How much a probe sees of a point with a normal, in [0, 1], by what its maps say.
+@wp.func
+def map_visibility(field: LightField, probe: wp.int32, position: wp.vec3, normal: wp.vec3) -> wp.float32:
+    if field.plain != 0:
+        return 1.0
     biased = position + normal * field.bias - field.positions[probe]
     distance = wp.length(biased)
     if distance < 1.0e-6:
-        return weight
-    weight = weight * surfel_visibility(field, probe, biased, distance)
-    if weight <= 0.0:
+        return 1.0
+    seen = surfel_visibility(field, probe, biased, distance)
+    if seen <= 0.0:
         return 0.0
     far = MOMENT_REACH * wp.length(field.spacing)
     moments = probe_moments(field, probe, octahedral_encode(biased))
-    return weight * chebyshev_visibility(moments, wp.min(distance, far))
+    return seen * chebyshev_visibility(moments, wp.min(distance, far))
+
+
+# Whether a point, in units of the grid, is so far outside of it that the nearest probes say nothing of its light.
+@wp.func
+def is_outside(field: LightField, at: wp.vec3) -> wp.bool:
+    outside = bool(False)
+    for axis in range(3):
+        if at[axis] < -OUTSIDE or at[axis] > wp.float32(field.counts[axis] - 1) + OUTSIDE:
+            outside = True
+    return outside
 
 
 # Irradiance [W/m^2] by light that surfaces reflect, at a point with a unit normal, from the eight probes around it.
@@ -283,9 +301,12 @@ def irradiance_at(field: LightField, position: wp.vec3, normal: wp.vec3) -> wp.v
     weights = float(0.0)
     corners = int(8)
     for corner in range(corners):
-        weight = corner_weight(field, cage, corner, at, position, normal)
+        probe = cage_probe(field, cage, corner)
+        weight = blend_weight(field, cage, corner, at, position, normal)
         if weight > 0.0:
-            total = total + probe_irradiance(field, cage_probe(field, cage, corner), uv) * weight
+            weight = weight * map_visibility(field, probe, position, normal)
+        if weight > 0.0:
+            total = total + probe_irradiance(field, probe, uv) * weight
             weights = weights + weight
     if weights <= 0.0:
         return wp.vec3(0.0, 0.0, 0.0)

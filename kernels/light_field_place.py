@@ -2,8 +2,10 @@
 
 import warp as wp
 
+from warp_gi.kernels.bsdf import bsdf_sample
 from warp_gi.kernels.bvh import bvh_intersect
 from warp_gi.kernels.environment import environment_radiance
+from warp_gi.kernels.gbuffer import CameraData, camera_ray
 from warp_gi.kernels.light_field import LightField
 from warp_gi.kernels.path_trace import (
     TERM_EMITTERS,
@@ -13,8 +15,8 @@ from warp_gi.kernels.path_trace import (
     PathSettings,
     trace_path,
 )
-from warp_gi.kernels.sampling import hash_uint
-from warp_gi.kernels.surface import surface_at, surface_emission
+from warp_gi.kernels.sampling import hash_uint, sample_1d, sample_2d
+from warp_gi.kernels.surface import ray_origin, surface_at, surface_emission
 from warp_gi.kernels.types import SceneData
 
 wp.set_module_options({"enable_backward": False})
@@ -22,6 +24,8 @@ wp.set_module_options({"enable_backward": False})
 PLACE_STEPS = wp.constant(6)
 PLACE_BACK = wp.constant(wp.float32(0.25))  # share of back faces from which a probe looks for a way out
 LIGHT_DEPTH = wp.constant(6)  # edges of the longest path that says where light is
+REACH_VERTICES = wp.constant(3)  # of a path that says what a camera's light goes over: the first hit and two more
+REACH_DIMENSIONS = wp.constant(3)
 PROBE_FACTOR = wp.constant(wp.uint32(2654435769))
 
 
@@ -107,6 +111,39 @@ def measure_light(
     total = path.environment + path.emitters + path.indirect
     total = total + surface_emission(scene, hit.face, hit.u, hit.v, -direction)
     light[i] = (total[0] + total[1] + total[2]) / 3.0
+
+
+# Thread: a path from the camera through a random point of the picture, by the BSDF. Sets the points that it meets,
+# [path * REACH_VERTICES], and 1 for each that there is.
+@wp.kernel
+def follow_paths(
+    first: wp.int32,
+    scene: SceneData,
+    camera: CameraData,
+    seed: wp.uint32,
+    points: wp.array(dtype=wp.vec3),
+    found: wp.array(dtype=wp.uint8),
+):
+    path = first + wp.tid()
+    index = wp.uint32(path)
+    u = sample_2d(index, seed, 0)
+    origin = camera.position
+    direction = camera_ray(camera, u[0] * wp.float32(camera.width), u[1] * wp.float32(camera.height))
+    vertices = int(REACH_VERTICES)
+    for k in range(vertices):
+        hit = bvh_intersect(scene.bvh, origin, direction, float(wp.inf))
+        if hit.face < 0:
+            break
+        s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
+        points[path * vertices + k] = s.position
+        found[path * vertices + k] = wp.uint8(1)
+        d = 1 + k * REACH_DIMENSIONS
+        wo = wp.transpose(s.shading) * -direction
+        b = bsdf_sample(s.bsdf, wo, sample_1d(index, seed, d), sample_2d(index, seed, d + 1))
+        direction = s.shading * b.wi
+        if b.pdf <= 0.0 or wp.dot(direction, s.normal) <= 0.0:
+            break
+        origin = ray_origin(s)
 
 
 # Thread: a probe. Moves it out of what it is inside of, or away from a wall that is too near, by at most `most` along

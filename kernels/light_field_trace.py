@@ -1,17 +1,34 @@
-"""Indirect light of a frame from light field probes: filtered irradiance, and rays traced through the probes.
+"""Indirect light of a frame from light field probes: filtered irradiance, and rays that end in what probes know.
 
-What probes hold is reflected light; what a ray sees of the sky and of emitters belongs to other terms.
+What probes hold is reflected light; what a ray sees of the sky and of emitters belongs to other terms. Rays are traced
+through the scene, and what they meet is lit by its own direct light and the probes' irradiance; or they are marched
+through the probes' maps. Where no probe sees a point, a path goes on from there.
 """
 
 import warp as wp
 
-from warp_gi.kernels.bsdf import BsdfSample, average_specular, bsdf_sample, diffuse_share, fresnel, specular_sample
+from warp_gi.kernels.bsdf import (
+    BsdfSample,
+    average_reflectance,
+    average_specular,
+    bsdf_sample,
+    diffuse_share,
+    fresnel,
+    specular_sample,
+)
+from warp_gi.kernels.bvh import BvhHit, bvh_intersect, bvh_occluded
 from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, primary_direction, tiled_pixel
 from warp_gi.kernels.light_field import (
     NOTHING,
     PROBE_USABLE,
     LightField,
-    irradiance_at,
+    blend_weight,
+    cage_of,
+    cage_probe,
+    grid_position,
+    is_outside,
+    map_visibility,
+    probe_irradiance,
     surfel_distance,
     surfel_normal,
     texel_emission,
@@ -19,6 +36,14 @@ from warp_gi.kernels.light_field import (
 )
 from warp_gi.kernels.light_field_march import MISS, march
 from warp_gi.kernels.octahedral import octahedral_encode, octahedral_texel
+from warp_gi.kernels.path_trace import (
+    TERM_EMITTERS,
+    TERM_ENVIRONMENT,
+    TERM_INDIRECT,
+    PathSamplers,
+    PathSettings,
+    trace_path,
+)
 from warp_gi.kernels.sampling import pixel_sample_index, pixel_seed, sample_1d, sample_2d
 from warp_gi.kernels.surface import Surface, ray_origin, shading_normal, surface_at
 from warp_gi.kernels.types import SceneData
@@ -29,16 +54,26 @@ MODE_IRRADIANCE = wp.constant(0)
 MODE_HYBRID = wp.constant(1)
 MODE_TRACED = wp.constant(2)
 MOST_STEPS = wp.constant(1 << 20)
-LOBE_DIMENSION = wp.constant(40)  # dimension pairs that the path tracer does not use at its first vertex
-DIRECTION_DIMENSION = wp.constant(41)
+RAYS_GEOMETRY = wp.constant(0)
+RAYS_PROBES = wp.constant(1)
+VISIBILITY_PROBES = wp.constant(0)
+VISIBILITY_EXACT = wp.constant(1)
+LOBE_DIMENSION = wp.constant(2000)  # dimension pairs that no path gets to
+DIRECTION_DIMENSION = wp.constant(2001)
 
 
 @wp.struct
 class ProbeQuery:
     mode: wp.int32  # MODE_*
+    through: wp.int32  # RAYS_*: what rays are traced through
+    visibility: wp.int32  # VISIBILITY_*: who tells which probes see a point
     rays: wp.int32  # of the current camera sample
     first_ray: wp.int32  # of the current camera sample, among those of the pixel
     ray_bits: wp.int32  # bits that count the rays of a pixel
+    samples: wp.int32  # the same three of the pipeline's samples, for paths where there are no rays
+    first_sample: wp.int32
+    sample_bits: wp.int32
+    paths: PathSettings  # of paths that go on where no probe sees a point
 
 
 # Sums over samples, [height * width].
@@ -65,7 +100,45 @@ class ProbeView:
     moment2: wp.array(dtype=wp.vec3)
 
 
-# What surfaces reflect towards `origin` from a direction, as far as the probes know.
+# What probes say of the light at a point.
+@wp.struct
+class SeenLight:
+    irradiance: wp.vec3  # W/m^2, by reflected light
+    probes: wp.int32  # that see the point; 0: none does, and nothing is known
+
+
+# The irradiance between the probes that see a point with a unit normal, by their maps or by shadow rays.
+@wp.func
+def seen_light(
+    scene: SceneData, field: LightField, visibility: wp.int32, position: wp.vec3, normal: wp.vec3, origin: wp.vec3
+) -> SeenLight:
+    r = SeenLight()
+    at = grid_position(field, position)
+    if is_outside(field, at):
+        return r
+    cage = cage_of(field, at)
+    uv = octahedral_encode(normal)
+    weights = float(0.0)
+    corners = int(8)
+    for corner in range(corners):
+        probe = cage_probe(field, cage, corner)
+        weight = blend_weight(field, cage, corner, at, position, normal)
+        if weight > 0.0:
+            if visibility == VISIBILITY_EXACT:
+                if bvh_occluded(scene.bvh, origin, field.positions[probe] - origin, 1.0):
+                    weight = 0.0
+            else:
+                weight = weight * map_visibility(field, probe, position, normal)
+        if weight > 0.0:
+            r.irradiance = r.irradiance + probe_irradiance(field, probe, uv) * weight
+            weights = weights + weight
+            r.probes += 1
+    if weights > 0.0:
+        r.irradiance = r.irradiance / weights
+    return r
+
+
+# What surfaces reflect towards `origin` from a direction, as far as the maps of the probes know.
 @wp.func
 def reflected_radiance(field: LightField, origin: wp.vec3, direction: wp.vec3) -> wp.vec3:
     hit = march(field, origin, direction, 0.0, float(wp.inf), MOST_STEPS)
@@ -81,38 +154,38 @@ class Lobes:
     glossy: wp.vec3  # as it goes out
 
 
-# Light that the filtered irradiance of the probes gives a surface: to its diffuse lobe, and in the mode without rays
-# to the glossy one as if that were Lambert too.
+# Light that irradiance gives a surface: to its diffuse lobe, and in the mode without rays to the glossy one as if that
+# were Lambert too.
 @wp.func
-def steady_light(field: LightField, s: Surface, mode: wp.int32) -> Lobes:
+def steady_light(irradiance: wp.vec3, s: Surface, mode: wp.int32) -> Lobes:
     r = Lobes()
-    if mode == MODE_TRACED or (mode == MODE_HYBRID and wp.max(s.bsdf.diffuse) <= 0.0):
+    if mode == MODE_TRACED:
         return r
-    normal = shading_normal(s)
-    arriving = irradiance_at(field, s.position, normal) / wp.pi
+    arriving = irradiance / wp.pi
     r.diffuse = wp.cw_mul(diffuse_share(s.bsdf), arriving)
     if mode == MODE_IRRADIANCE:
         r.glossy = wp.cw_mul(average_specular(s.bsdf), arriving)
     return r
 
 
-# Light of a ray through the probes, by the glossy lobe alone or by the whole BSDF.
+# Direction of a ray, by the glossy lobe alone or by the whole BSDF.
 @wp.func
-def ray_light(field: LightField, s: Surface, wo: wp.vec3, mode: wp.int32, index: wp.uint32, seed: wp.uint32) -> Lobes:
-    r = Lobes()
+def ray_direction(s: Surface, wo: wp.vec3, mode: wp.int32, index: wp.uint32, seed: wp.uint32) -> BsdfSample:
     u = sample_2d(index, seed, DIRECTION_DIMENSION)
-    sample = BsdfSample()
     if mode == MODE_HYBRID:
-        sample = specular_sample(s.bsdf, wo, u)
-    else:
-        u_lobe = float(0.0)
-        if s.bsdf.f90 > 0.0:
-            u_lobe = sample_1d(index, seed, LOBE_DIMENSION)
-        sample = bsdf_sample(s.bsdf, wo, u_lobe, u)
-    wi = s.shading * sample.wi
-    if sample.pdf <= 0.0 or wp.dot(wi, s.normal) <= 0.0:
-        return r
-    light = reflected_radiance(field, ray_origin(s), wi)
+        return specular_sample(s.bsdf, wo, u)
+    u_lobe = float(0.0)
+    if s.bsdf.f90 > 0.0:
+        u_lobe = sample_1d(index, seed, LOBE_DIMENSION)
+    return bsdf_sample(s.bsdf, wo, u_lobe, u)
+
+
+# Shares of both lobes in the light that a direction brings. A ray of the mode "hybrid" is all of the glossy lobe's; one
+# of the mode "traced" was drawn from both: weight = f cos / pdf, of which the diffuse lobe has
+# (1 - F) cos / (pi pdf) times its colour.
+@wp.func
+def lobes_of(s: Surface, wo: wp.vec3, sample: BsdfSample, light: wp.vec3, mode: wp.int32) -> Lobes:
+    r = Lobes()
     r.glossy = wp.cw_mul(sample.weight, light)
     if mode == MODE_TRACED:
         f = wp.vec3(0.0, 0.0, 0.0)
@@ -122,6 +195,72 @@ def ray_light(field: LightField, s: Surface, wo: wp.vec3, mode: wp.int32, index:
         r.diffuse = wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - f, light) * share
         r.glossy = r.glossy - wp.cw_mul(s.bsdf.diffuse, r.diffuse)
     return r
+
+
+# What a surface that a ray meets reflects against the ray: its direct light, sampled, and what the probes know; or a
+# path goes on from there. `by_path` is 1 for the first hit of a camera ray, where a path stands for all of the term.
+@wp.func
+def reflected_light(
+    scene: SceneData,
+    field: LightField,
+    query: ProbeQuery,
+    hit: BvhHit,
+    towards: wp.vec3,
+    by_path: wp.bool,
+    index: wp.uint32,
+    seed: wp.uint32,
+) -> wp.vec3:
+    s = surface_at(scene, hit.face, hit.u, hit.v, towards)
+    paths = query.paths
+    known = wp.vec3(0.0, 0.0, 0.0)
+    if by_path:
+        paths.terms = TERM_INDIRECT
+    else:
+        normal = shading_normal(s)
+        seen = seen_light(scene, field, query.visibility, s.position, normal, ray_origin(s))
+        paths.terms = TERM_ENVIRONMENT | TERM_EMITTERS
+        if seen.probes > 0:
+            known = wp.cw_mul(average_reflectance(s.bsdf), seen.irradiance) / wp.pi
+        else:
+            paths.terms = TERM_ENVIRONMENT | TERM_EMITTERS | TERM_INDIRECT
+    light = trace_path(scene, PathSamplers(), hit, s, towards, paths, index, seed, -1)
+    return known + light.environment + light.emitters + light.indirect
+
+
+# Light of one ray of a pixel.
+@wp.func
+def ray_light(
+    scene: SceneData,
+    field: LightField,
+    query: ProbeQuery,
+    s: Surface,
+    hit: BvhHit,
+    towards: wp.vec3,
+    by_path: wp.bool,
+    index: wp.uint32,
+    seed: wp.uint32,
+) -> Lobes:
+    r = Lobes()
+    wo = wp.transpose(s.shading) * towards
+    sample = BsdfSample()
+    start = hit
+    back = towards
+    if not by_path:
+        sample = ray_direction(s, wo, query.mode, index, seed)
+        wi = s.shading * sample.wi
+        if sample.pdf <= 0.0 or wp.dot(wi, s.normal) <= 0.0:
+            return r
+        if query.through == RAYS_PROBES:
+            return lobes_of(s, wo, sample, reflected_radiance(field, ray_origin(s), wi), query.mode)
+        start = bvh_intersect(scene.bvh, ray_origin(s), wi, float(wp.inf))
+        back = -wi
+        if start.face < 0:
+            return r
+    light = reflected_light(scene, field, query, start, back, by_path, index, seed)
+    if by_path:
+        r.glossy = light
+        return r
+    return lobes_of(s, wo, sample, light, query.mode)
 
 
 # Thread: a pixel.
@@ -140,27 +279,42 @@ def trace_probes(
     if p[0] >= camera.width or p[1] >= camera.height:
         return
     pixel = p[1] * camera.width + p[0]
-    face = hits.face[pixel]
-    if face < 0:
+    hit = BvhHit()
+    hit.face = hits.face[pixel]
+    if hit.face < 0:
         return
-    s = surface_at(scene, face, hits.u[pixel], hits.v[pixel], -hits.direction[pixel])
-    wo = wp.transpose(s.shading) * -hits.direction[pixel]
-    steady = steady_light(field, s, query.mode)
+    hit.t = hits.t[pixel]
+    hit.u = hits.u[pixel]
+    hit.v = hits.v[pixel]
+    towards = -hits.direction[pixel]
+    s = surface_at(scene, hit.face, hit.u, hit.v, towards)
+    seen = SeenLight()
+    seen.probes = 1
+    if query.mode != MODE_TRACED and (query.mode == MODE_IRRADIANCE or wp.max(s.bsdf.diffuse) > 0.0):
+        seen = seen_light(scene, field, query.visibility, s.position, shading_normal(s), ray_origin(s))
+    by_path = seen.probes == 0
+    steady = steady_light(seen.irradiance, s, query.mode)
     rays = int(0)
-    if query.mode == MODE_TRACED or (query.mode == MODE_HYBRID and s.bsdf.f90 > 0.0):
+    first_ray = query.first_ray
+    ray_bits = query.ray_bits
+    if by_path and query.mode == MODE_IRRADIANCE:
+        rays = query.samples
+        first_ray = query.first_sample
+        ray_bits = query.sample_bits
+    elif by_path or query.mode == MODE_TRACED or (query.mode == MODE_HYBRID and s.bsdf.f90 > 0.0):
         rays = query.rays
     share = wp.float32(settings.sample_count)  # samples that one evaluation stands for
     if rays > 0:
         share = share / wp.float32(rays)
-    seed = pixel_seed(p[0], p[1], query.ray_bits, settings.seed)
-    first_index = pixel_sample_index(p[0], p[1], query.first_ray, query.ray_bits)
+    seed = pixel_seed(p[0], p[1], ray_bits, settings.seed)
+    first_index = pixel_sample_index(p[0], p[1], first_ray, ray_bits)
     diffuse = wp.vec3(0.0, 0.0, 0.0)
     glossy = wp.vec3(0.0, 0.0, 0.0)
     moment2 = wp.vec3(0.0, 0.0, 0.0)
     for i in range(wp.max(rays, 1)):
         light = steady
         if rays > 0:
-            by_ray = ray_light(field, s, wo, query.mode, first_index + wp.uint32(i), seed)
+            by_ray = ray_light(scene, field, query, s, hit, towards, by_path, first_index + wp.uint32(i), seed)
             light.diffuse = light.diffuse + by_ray.diffuse
             light.glossy = light.glossy + by_ray.glossy
         leaving = wp.cw_mul(s.bsdf.diffuse, light.diffuse) + light.glossy
@@ -175,9 +329,27 @@ def trace_probes(
     # the variance of the mean is taken for that of `sample_count` samples, and there were count / share
     spread = moment2 * (share / count) - wp.cw_mul(mean, mean)
     buffers.moment2[pixel] = buffers.moment2[pixel] + (wp.cw_mul(mean, mean) + spread * share) * count
-    if buffers.diffuse.shape[0] > 0:
+    if buffers.diffuse.shape[0] > 0 and not by_path:  # a denoiser shares out what no one separated
         buffers.diffuse[pixel] = buffers.diffuse[pixel] + diffuse * share
         buffers.glossy[pixel] = buffers.glossy[pixel] + glossy * share
+
+
+# Thread: a pixel of a first hit. How many of the probes around it see it, 0 to 8; -1 where nothing was hit.
+@wp.kernel
+def count_probes(
+    first: wp.int32,
+    scene: SceneData,
+    field: LightField,
+    visibility: wp.int32,
+    hits: PrimaryHits,
+    counts: wp.array(dtype=wp.int32),
+):
+    pixel = first + wp.tid()
+    counts[pixel] = -1
+    if hits.face[pixel] >= 0:
+        s = surface_at(scene, hits.face[pixel], hits.u[pixel], hits.v[pixel], -hits.direction[pixel])
+        seen = seen_light(scene, field, visibility, s.position, shading_normal(s), ray_origin(s))
+        counts[pixel] = seen.probes
 
 
 # What the sky sends against a direction, from the first probe that sees it there.

@@ -1,4 +1,9 @@
-"""Where light field probes stand: the box that the grid fills, and the way out of walls and into the light."""
+"""Where light field probes stand: the box that the grid fills, and the way out of walls and into the light.
+
+The box is that of what paths from the camera reach, over the whole of its path: all that a picture shows, and what lights
+that over one more surface. Bounds of a scene reach behind its walls, to lamps above the ceiling and to the end of its
+ground; and what is brightly lit may be nowhere near the camera.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +17,24 @@ import warp as wp
 
 from warp_gi import launch
 from warp_gi.alias import AliasTable
+from warp_gi.camera import Camera, CameraPath
 from warp_gi.errors import OptionError
 from warp_gi.kernels import light_field_place as kernels
 from warp_gi.kernels import types
 from warp_gi.techniques.baselines import sky_probability
 
-AUTOMATIC_PROBES = 64
-"""About as many as there are where neither counts nor spacing are given; the paper's living room has 4 x 4 x 4."""
+AUTOMATIC_PROBES = 430
+"""Most that there are where neither counts nor spacing are given."""
+UNSEEN_PROBES = 128
+"""The same where no camera says what is looked at."""
+AUTOMATIC_STEPS = 12
+"""Distances between probes along the longest side of the box, if that does not make too many of them."""
+REACH_PATHS, REACH_CAMERAS, LEAST_REACHED = 40_000, 32, 400
+"""Paths that say what a camera reaches, most frames of a camera path that they start in, and points without which they
+say nothing: nearly all of them left the scene."""
+REACH_QUANTILE, REACH_MORE = 0.005, 0.1
+"""Share of the points that may lie outside of the box on each side, for some windows look far; and how far first hits
+among them widen it all the same, in sizes of the box."""
 INSET = 0.3
 """Distance of the outermost probes from the border, in distances between probes: where points by a wall have a probe
 near and light is as it is in the room. At 0.5 rooms come out 5 to 10 % too bright; at 0.2 grids lose
@@ -60,30 +76,98 @@ class ProbeGrid:
         return self.low + np.stack([x, y, z], axis=-1).reshape(-1, 3) * self.spacing
 
 
-def probe_grid(bounds: np.ndarray, counts: Sequence[int], spacing: float, resolution: int) -> ProbeGrid:
+def probe_grid(
+    bounds: np.ndarray, counts: Sequence[int], spacing: float, resolution: int, most: int = AUTOMATIC_PROBES
+) -> ProbeGrid:
     """Return the grid over ``bounds`` [2, 3] with so many probes along each axis, or so many metres between them.
 
-    Counts of 0 follow from the spacing; without either there are about 64 probes, as evenly spaced as possible.
-    Raises OptionError for more probes than can be held.
+    Counts of 0 follow from the spacing; without one that is a twelfth of the longest side, or as much more as it takes
+    for no more than ``most`` probes. Raises OptionError for more probes than can be held.
     """
     low, high = bounds.astype(np.float64)
     extent = np.maximum(high - low, 1e-3 * max(float((high - low).max()), 1e-3))  # a flat scene has a little height
-    step = spacing or float(np.prod(extent) / AUTOMATIC_PROBES) ** (1 / 3)
     least = 1 if spacing else 2  # eight probes around every point, unless told otherwise
-    found = tuple(int(n) or max(least, round(min(e / step, 1e9))) for n, e in zip(counts, extent, strict=True))
+    step = spacing or float(extent.max()) / AUTOMATIC_STEPS
+
+    def along(step: float) -> tuple[int, ...]:
+        return tuple(int(n) or max(least, round(min(e / step, 1e9))) for n, e in zip(counts, extent, strict=True))
+
+    if not spacing and not all(counts):
+        while math.prod(along(step)) > most and step < extent.max():
+            step *= 1.01
+    found = along(step)
     texels = math.prod(found) * resolution**2
     if math.prod(found) > MOST_PROBES or texels > MOST_TEXELS:
         raise OptionError(
             f"{' x '.join(map(str, found))} probes of {resolution} x {resolution} texels are more than the "
             f"{MOST_PROBES:,} probes or {MOST_TEXELS:,} texels that are supported; use fewer or smaller ones"
         )
-    along = np.array(found)
-    cells = extent / np.where(along > 1, along - 1 + 2 * INSET, 1.0)
-    return ProbeGrid((low + high) / 2 - cells * (along - 1) / 2, cells, found)
+    numbers = np.array(found)
+    cells = extent / np.where(numbers > 1, numbers - 1 + 2 * INSET, 1.0)
+    return ProbeGrid((low + high) / 2 - cells * (numbers - 1) / 2, cells, found)
+
+
+def place_grid(scene: Any, settings: Any, camera: Camera | CameraPath | None, device: wp.Device) -> ProbeGrid:
+    """Return the grid of a LightFieldProbes for what a camera reaches; without one the scene's own do.
+
+    Where there is none, or none that sees anything, light says what is worth a probe, and there are fewer of them.
+    Raises OptionError for more probes than can be held.
+    """
+    cameras = cameras_of(camera) or list(scene.cameras.values())
+    box, most = seen_bounds(scene, cameras, device), AUTOMATIC_PROBES
+    if box is None:
+        box, most = lit_bounds(scene, device), UNSEEN_PROBES
+    return probe_grid(box, settings.counts, settings.spacing, settings.largest_map, most)
+
+
+def cameras_of(camera: Camera | CameraPath | None) -> list[Camera]:
+    """Return where a camera is over its whole path, in some frames evenly from the first to the last."""
+    if camera is None:
+        return []
+    if isinstance(camera, Camera):
+        return [camera]
+    frames = np.linspace(0, camera.frame_count - 1, min(camera.frame_count, REACH_CAMERAS))
+    return [camera.camera(int(frame)) for frame in np.unique(np.round(frames))]
+
+
+def seen_bounds(scene: Any, cameras: Sequence[Camera], device: wp.Device) -> np.ndarray | None:
+    """Return the box around what paths from cameras meet, float64 [2, 3]; None if that is nothing.
+
+    Points count by one over their distance from the camera: a surface twice as far shows half the detail, and a plane
+    to the horizon, which fills a tenth of a picture, does not stretch the box to a hundred times what stands on it.
+    """
+    from warp_gi.scheduler import camera_data  # the scheduler imports the techniques
+
+    along, points, weights, first = int(kernels.REACH_VERTICES), [], [], []
+    for number, camera in enumerate(cameras):
+        size = REACH_PATHS // len(cameras)
+        at = wp.zeros(size * along, dtype=wp.vec3, device=device)
+        found = wp.zeros(size * along, dtype=wp.uint8, device=device)
+        inputs = [scene.data(device), camera_data(camera), number + 1, at, found]
+        launch.launch(kernels.follow_paths, size, inputs, device)
+        met = found.numpy().astype(bool)
+        points.append(at.numpy().astype(np.float64)[met])
+        weights.append(1 / np.maximum(np.linalg.norm(points[-1] - camera.position, axis=1), 1e-3 * scene.radius))
+        first.append((np.arange(len(met)) % along == 0)[met])
+    if sum(map(len, points)) < LEAST_REACHED:
+        return None
+    at, weight, is_first = np.concatenate(points), np.concatenate(weights), np.concatenate(first)
+    box = np.stack([_quantiles(at[:, axis], weight) for axis in range(3)], axis=1)
+    more = REACH_MORE * (box[1] - box[0])
+    seen = at[is_first]
+    low, high = np.maximum(seen.min(axis=0), box[0] - more), np.minimum(seen.max(axis=0), box[1] + more)
+    return np.stack([np.minimum(box[0], low), np.maximum(box[1], high)])
+
+
+def _quantiles(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the two values outside of which lies ``REACH_QUANTILE`` of the weight, each."""
+    order = np.argsort(values, kind="stable")
+    share = np.cumsum(weights[order])
+    return np.interp([REACH_QUANTILE * share[-1], (1 - REACH_QUANTILE) * share[-1]], share, values[order])
 
 
 def lit_bounds(scene: Any, device: wp.Device) -> np.ndarray:
-    """Return the box around the space that light reaches or a camera of the scene sees, float64 [2, 3].
+    """Return the box around the space that light reaches, float64 [2, 3], for scenes that no camera looks at.
 
     Bounds of a room reach behind its walls, to lamps above the ceiling and trees before the window, where probes would
     be of no use. Of points in them, on a regular grid, those that see few back faces and a good share of the light
@@ -100,7 +184,7 @@ def lit_bounds(scene: Any, device: wp.Device) -> np.ndarray:
     typical = _typical(light)
     if typical <= 0:
         return bounds
-    useful = _is_lit(light, typical) | _seen_by_cameras(scene, points, device)
+    useful = _is_lit(light, typical)
     if not useful.any():
         return bounds
     useful = useful.reshape(SLABS, SLABS, SLABS)
@@ -135,16 +219,6 @@ def _typical(light: np.ndarray) -> float:
 def _is_lit(light: np.ndarray, typical: float) -> np.ndarray:
     """Return bool [point]; a single bright direction, which another point may miss, counts no more than others."""
     return _is_free(light) & (np.clip(light, 0, typical).mean(axis=1) > LIT_SHARE * typical)
-
-
-def _seen_by_cameras(scene: Any, points: np.ndarray, device: wp.Device) -> np.ndarray:
-    """Return bool [point]: whether there is nothing between it and one of the scene's cameras."""
-    seen = np.zeros(len(points), bool)
-    for camera in scene.cameras.values():
-        origins = np.broadcast_to(camera.position, points.shape).astype(np.float32)
-        ways = points.astype(np.float32) - origins
-        seen |= scene.bvh(device).occluded(origins, ways, t_max=1.0).numpy() == 0
-    return seen
 
 
 def relocate(scene: Any, data: types.SceneData, grid: ProbeGrid, field: Any, device: wp.Device) -> None:

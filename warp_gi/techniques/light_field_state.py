@@ -11,11 +11,12 @@ import warp as wp
 
 from warp_gi import launch
 from warp_gi.baking import Bake
+from warp_gi.camera import Camera, CameraPath
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_bake as bake_kernels
 from warp_gi.kernels import types
 from warp_gi.techniques.baselines import sky_probability
-from warp_gi.techniques.light_field_places import ProbeGrid, lit_bounds, lit_data, probe_grid, relocate
+from warp_gi.techniques.light_field_places import ProbeGrid, cameras_of, lit_data, place_grid, relocate
 
 LIGHT_RESOLUTION, DISTANCE_RESOLUTION = 32, 64
 """Texels along a side of what irradiance and moments are filtered from, each the mean over the texels in it."""
@@ -50,11 +51,18 @@ def low_directions(resolution: int) -> np.ndarray:
 class ProbeState:
     """The probes of an estimator on a device, and how far they are behind the scene."""
 
-    def __init__(self, scene: Any, device: wp.Device, settings: Any, seed: int, bake: Bake | None = None) -> None:
-        self.device, self.settings, self.seed = device, settings, seed
+    def __init__(
+        self,
+        scene: Any,
+        device: wp.Device,
+        settings: Any,
+        seed: int,
+        bake: Bake | None = None,
+        camera: Camera | CameraPath | None = None,
+    ) -> None:
+        self.device, self.settings, self.seed, self.camera = device, settings, seed, camera
         if bake is None:
-            box = lit_bounds(scene, device)
-            self.grid = probe_grid(box, settings.counts, settings.spacing, settings.largest_map)
+            self.grid = place_grid(scene, settings, camera, device)
             bounds = scene.bounds
         else:
             arrays = bake.arrays
@@ -68,6 +76,7 @@ class ProbeState:
         self.pending = np.zeros(self.grid.probe_count, np.int32)
         """Refreshes that each probe still needs."""
         self._cursor = 0
+        self._alias: Any = None
         self.field = self._empty_field(bounds.astype(np.float64))
         if bake is not None:
             self._load(bake)
@@ -99,6 +108,16 @@ class ProbeState:
 
     def _array(self, values: np.ndarray, dtype: Any) -> wp.array:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
+
+    def lit_data(self, scene: Any) -> types.SceneData:
+        """Return ``light_field_places.lit_data`` of the scene's pose, whose table of emitters is made once."""
+        data = launch.copied(scene.data(self.device), types.SceneData)
+        data.emitters = launch.copied(data.emitters, types.Emitters)
+        if scene.emitter_count:
+            if self._alias is None:
+                self._alias = lit_data(scene, self.device).emitters.alias
+            data.emitters.alias = self._alias
+        return data
 
     # ---- filling ----
 
