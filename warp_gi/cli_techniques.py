@@ -16,7 +16,7 @@ from warp_gi.scene.scene import Scene
 from warp_gi.techniques import light_field_export, light_field_pictures, visibility_export
 from warp_gi.techniques.light_field_places import probe_grid
 from warp_gi.techniques.light_field_probes import LightFieldProbes
-from warp_gi.techniques.light_field_state import bounce_changes
+from warp_gi.techniques.light_field_state import baked_resolution, bounce_changes
 from warp_gi.techniques.visibility_field import VisibilityField
 
 Rows = list[tuple[str, Any]]
@@ -118,7 +118,7 @@ def _check_grid(settings: LightFieldProbes, scene: Scene) -> None:
 
 def _summary_of_probes(bake: Bake, seconds: float) -> Rows:
     counts, settings, changes = bake.counts, bake.settings, bounce_changes(bake)
-    size, few = int(settings["resolution"]), int(settings["irradiance_resolution"])
+    size, few = baked_resolution(bake), int(settings["irradiance_resolution"])
     return [
         ("probes", int(counts["probes"])),
         ("probes usable", int(counts["probes"] - counts["covered"])),

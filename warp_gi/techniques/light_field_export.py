@@ -20,6 +20,7 @@ from warp_gi.errors import BakeError, OptionError
 from warp_gi.exr import HALF_MAX
 from warp_gi.files import replacing
 from warp_gi.kernels import light_field as field_kernels
+from warp_gi.techniques.light_field_state import baked_resolution
 from warp_gi.techniques.octahedral_atlas import (
     MAPPING,
     PADDING,
@@ -99,7 +100,7 @@ def probe_maps(bake: Bake) -> dict[str, Callable[[int], np.ndarray]]:
     if bake.technique != "LightFieldProbes":
         raise BakeError(f"only bakes of LightFieldProbes have atlases, this one is of {bake.technique}")
     arrays = bake.arrays
-    texels, few = int(bake.settings["resolution"]) ** 2, int(bake.settings["irradiance_resolution"]) ** 2
+    texels, few = baked_resolution(bake) ** 2, int(bake.settings["irradiance_resolution"]) ** 2
 
     def part(name: str, probe: int, size: int) -> np.ndarray:
         return arrays[name][probe * size : (probe + 1) * size]
@@ -150,7 +151,7 @@ def export_atlases(bake: Bake, path: str | Path) -> list[Path]:
     counts = tuple(int(n) for n in bake.arrays["grid_counts"])
     columns = atlas_columns(counts)
     rows = -(-math.prod(counts) // columns)
-    largest = int(bake.settings["resolution"]) + 2 * PADDING
+    largest = baked_resolution(bake) + 2 * PADDING
     warn_if_too_large(path.name, columns * largest, rows * largest, "use fewer probes or a lower resolution")
     files = {name: path.with_name(f"{path.stem}.{name}.exr") for name in ATLASES}
     description = path.with_name(f"{path.stem}.json")
@@ -179,6 +180,7 @@ def _atlas(maker: Callable[[int], np.ndarray], count: int, columns: int, rows: i
 
 def _description(bake: Bake, columns: int, rows: int, files: dict[str, Path]) -> str:
     arrays = bake.arrays
+    sizes = {"resolution": baked_resolution(bake), "irradiance_resolution": int(bake.settings["irradiance_resolution"])}
     per_axis = lambda values: dict(zip("xyz", (v.item() for v in values), strict=True))  # noqa: E731
     info = {
         "format": FORMAT,
@@ -194,7 +196,7 @@ def _description(bake: Bake, columns: int, rows: int, files: dict[str, Path]) ->
         "atlases": {
             name: {
                 "file": files[name].name,
-                "size": int(bake.settings[setting]),
+                "size": sizes[setting],
                 "channels": list(channels),
                 "type": kind,
                 "units": units,

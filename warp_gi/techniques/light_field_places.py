@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -23,10 +23,14 @@ from warp_gi.kernels import light_field_place as kernels
 from warp_gi.kernels import types
 from warp_gi.techniques.baselines import sky_probability
 
-AUTOMATIC_PROBES = 430
+AUTOMATIC_PROBES = 440
 """Most that there are where neither counts nor spacing are given."""
-UNSEEN_PROBES = 128
-"""The same where no camera says what is looked at."""
+FEWER_PROBES = 128
+"""The same in rooms, and where no camera says what is looked at."""
+ROOM_SHARE = 0.06
+"""A camera is in a room if fewer of the ways from what it sees, and on from there, lead out of the scene."""
+FEW_RESOLUTION, MANY_RESOLUTION = 128, 64
+"""Texels along a side of a map unless told: of up to ``FEWER_PROBES`` probes, and of more."""
 AUTOMATIC_STEPS = 12
 """Distances between probes along the longest side of the box, if that does not make too many of them."""
 REACH_PATHS, REACH_CAMERAS, LEAST_REACHED = 40_000, 32, 400
@@ -113,11 +117,16 @@ def place_grid(scene: Any, settings: Any, camera: Camera | CameraPath | None, de
     Where there is none, or none that sees anything, light says what is worth a probe, and there are fewer of them.
     Raises OptionError for more probes than can be held.
     """
-    cameras = cameras_of(camera) or list(scene.cameras.values())
-    box, most = seen_bounds(scene, cameras, device), AUTOMATIC_PROBES
-    if box is None:
-        box, most = lit_bounds(scene, device), UNSEEN_PROBES
-    return probe_grid(box, settings.counts, settings.spacing, settings.largest_map, most)
+    seen = seen_space(scene, cameras_of(camera) or list(scene.cameras.values()), device)
+    if seen is None:
+        seen = Space(lit_bounds(scene, device), 0.0)
+    most = AUTOMATIC_PROBES if seen.leaving > ROOM_SHARE else FEWER_PROBES
+    return probe_grid(seen.bounds, settings.counts, settings.spacing, settings.largest_map, most)
+
+
+def map_resolution(resolution: int, probes: int) -> int:
+    """Return the texels along a side of a map that a setting of ``resolution`` means for so many probes."""
+    return resolution or (FEW_RESOLUTION if probes <= FEWER_PROBES else MANY_RESOLUTION)
 
 
 def cameras_of(camera: Camera | CameraPath | None) -> list[Camera]:
@@ -130,8 +139,17 @@ def cameras_of(camera: Camera | CameraPath | None) -> list[Camera]:
     return [camera.camera(int(frame)) for frame in np.unique(np.round(frames))]
 
 
-def seen_bounds(scene: Any, cameras: Sequence[Camera], device: wp.Device) -> np.ndarray | None:
-    """Return the box around what paths from cameras meet, float64 [2, 3]; None if that is nothing.
+class Space(NamedTuple):
+    """What paths from a camera reach."""
+
+    bounds: np.ndarray
+    """float64 [2, 3], metres."""
+    leaving: float
+    """Share of the ways from what the paths meet that lead out of the scene."""
+
+
+def seen_space(scene: Any, cameras: Sequence[Camera], device: wp.Device) -> Space | None:
+    """Return the box around what paths from cameras meet; None if that is nothing.
 
     Points count by one over their distance from the camera: a surface twice as far shows half the detail, and a plane
     to the horizon, which fills a tenth of a picture, does not stretch the box to a hundred times what stands on it.
@@ -139,6 +157,7 @@ def seen_bounds(scene: Any, cameras: Sequence[Camera], device: wp.Device) -> np.
     from warp_gi.scheduler import camera_data  # the scheduler imports the techniques
 
     along, points, weights, first = int(kernels.REACH_VERTICES), [], [], []
+    ways = left = 0
     for number, camera in enumerate(cameras):
         size = REACH_PATHS // len(cameras)
         at = wp.zeros(size * along, dtype=wp.vec3, device=device)
@@ -146,6 +165,8 @@ def seen_bounds(scene: Any, cameras: Sequence[Camera], device: wp.Device) -> np.
         inputs = [scene.data(device), camera_data(camera), number + 1, at, found]
         launch.launch(kernels.follow_paths, size, inputs, device)
         met = found.numpy().astype(bool)
+        here, then = met.reshape(size, along)[:, :-1], met.reshape(size, along)[:, 1:]
+        ways, left = ways + int(here.sum()), left + int((here & ~then).sum())
         points.append(at.numpy().astype(np.float64)[met])
         weights.append(1 / np.maximum(np.linalg.norm(points[-1] - camera.position, axis=1), 1e-3 * scene.radius))
         first.append((np.arange(len(met)) % along == 0)[met])
@@ -156,7 +177,7 @@ def seen_bounds(scene: Any, cameras: Sequence[Camera], device: wp.Device) -> np.
     more = REACH_MORE * (box[1] - box[0])
     seen = at[is_first]
     low, high = np.maximum(seen.min(axis=0), box[0] - more), np.minimum(seen.max(axis=0), box[1] + more)
-    return np.stack([np.minimum(box[0], low), np.maximum(box[1], high)])
+    return Space(np.stack([np.minimum(box[0], low), np.maximum(box[1], high)]), left / max(ways, 1))
 
 
 def _quantiles(values: np.ndarray, weights: np.ndarray) -> np.ndarray:

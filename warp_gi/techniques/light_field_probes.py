@@ -18,7 +18,7 @@ from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_trace as trace_kernels
 from warp_gi.kernels import path_trace
 from warp_gi.techniques.baselines import BsdfPaths, sky_probability
-from warp_gi.techniques.light_field_places import lit_data
+from warp_gi.techniques.light_field_places import MOST_PROBES, lit_data, map_resolution
 from warp_gi.techniques.light_field_state import ProbeState, sky_bytes
 
 _MODES = {
@@ -59,11 +59,11 @@ class LightFieldProbes(Estimator):
     spacing: float = 0.0
     """Metres between probes; 0 is a twelfth of the longest side, or as much more as it takes for at most 430 probes, 128
     if no camera is known."""
-    resolution: int = 256
-    """Texels along a side of a probe's map, a multiple of 16."""
+    resolution: int = 0
+    """Texels along a side of a probe's map, a multiple of 16; 0 is 128 for up to 128 probes, 64 for more."""
     irradiance_resolution: int = 32
     """Texels along a side of its map of irradiance; the paper has 32 to 128."""
-    rays: int = 4
+    rays: int = 2
     """Rays a texel while baking."""
     bounces: int = 16
     """Most passes of light from probes to probes; the first is light that was reflected once."""
@@ -97,7 +97,7 @@ class LightFieldProbes(Estimator):
                 raise unknown_name(f"{name} of light field probes", value, known)
         block = int(field_kernels.BLOCK)
         for name, least, most in (
-            ("resolution", block, MOST_RESOLUTION),
+            ("resolution", 0, MOST_RESOLUTION),
             ("irradiance_resolution", 4, 128),
             ("rays", 1, 1024),
             ("bounces", 1, 1000),
@@ -106,7 +106,7 @@ class LightFieldProbes(Estimator):
         ):
             check_whole(name, getattr(self, name), least, most)
         if self.resolution % block:
-            raise OptionError(f"resolution must be a multiple of {block}, got {self.resolution}")
+            raise OptionError(f"resolution must be a multiple of {block}, or 0 (automatic), got {self.resolution}")
         if not isinstance(self.counts, tuple | list) or len(self.counts) != 3:
             raise OptionError(f"counts must be three whole numbers, along x, y and z, got {self.counts!r}")
         for count in self.counts:
@@ -179,8 +179,8 @@ class LightFieldProbes(Estimator):
 
     @property
     def largest_map(self) -> int:
-        """Texels along a side of the largest map of a probe."""
-        return max(self.resolution, self.irradiance_resolution)
+        """Texels along a side of the largest map of a probe, if there are many of them."""
+        return max(map_resolution(self.resolution, MOST_PROBES), self.irradiance_resolution)
 
     @property
     def makes_primary(self) -> bool:

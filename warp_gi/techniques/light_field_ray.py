@@ -81,7 +81,7 @@ def ray_looks(state: Any, origin: np.ndarray, direction: np.ndarray) -> tuple[li
     ``direction`` (unit) are float [3]; the hit has the fields of ``MarchHits``.
     """
     origin, direction = np.asarray(origin, np.float64), np.asarray(direction, np.float64)
-    resolution, positions = state.settings.resolution, state.field.positions.numpy()
+    resolution, positions = state.resolution, state.field.positions.numpy()
 
     def march(most_steps: int) -> dict[str, Any]:
         found = march_rays(state, origin[None], direction[None], most_steps)
@@ -187,7 +187,7 @@ def _panel(
     """Return the map of the probe of ``looks`` with them and the ray over it, and a caption below."""
     from PIL import Image, ImageDraw
 
-    probe, resolution, block = looks[0].probe, state.settings.resolution, int(field_kernels.BLOCK)
+    probe, resolution, block = looks[0].probe, state.resolution, int(field_kernels.BLOCK)
     texels = resolution**2
     light = unpack_radiance(state.field.radiance[probe * texels : (probe + 1) * texels].numpy())
     colors = tone_map(light.reshape(resolution, resolution, 3), exposure)

@@ -16,7 +16,7 @@ from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_bake as bake_kernels
 from warp_gi.kernels import types
 from warp_gi.techniques.baselines import sky_probability
-from warp_gi.techniques.light_field_places import ProbeGrid, cameras_of, lit_data, place_grid, relocate
+from warp_gi.techniques.light_field_places import ProbeGrid, lit_data, map_resolution, place_grid, relocate
 
 LIGHT_RESOLUTION, DISTANCE_RESOLUTION = 32, 64
 """Texels along a side of what irradiance and moments are filtered from, each the mean over the texels in it."""
@@ -68,6 +68,8 @@ class ProbeState:
             arrays = bake.arrays
             counts = tuple(int(n) for n in arrays["grid_counts"])
             self.grid, bounds = ProbeGrid(arrays["grid_low"], arrays["grid_spacing"], counts), arrays["bounds"]
+        self.resolution = map_resolution(settings.resolution, self.grid.probe_count)
+        """Texels along a side of a map."""
         self.changes: list[float] = []
         """Change of the irradiance by each bounce, as a share of it."""
         self.key = ""
@@ -83,12 +85,12 @@ class ProbeState:
 
     def _empty_field(self, bounds: np.ndarray) -> Any:
         grid, settings = self.grid, self.settings
-        count, texels = grid.probe_count, settings.resolution**2
+        count, texels = grid.probe_count, self.resolution**2
         margin = 1e-3 * float(np.linalg.norm(bounds[1] - bounds[0]))
         field = field_kernels.LightField()
         field.low, field.spacing = wp.vec3(*grid.low), wp.vec3(*grid.spacing)
         field.counts = wp.vec3i(*grid.counts)
-        field.resolution, field.irradiance_resolution = settings.resolution, settings.irradiance_resolution
+        field.resolution, field.irradiance_resolution = self.resolution, settings.irradiance_resolution
         field.bias = BIAS * float(grid.spacing.min())
         field.plain = int(settings.weights == "trilinear")
         field.bounds_low, field.bounds_high = wp.vec3(*(bounds[0] - margin)), wp.vec3(*(bounds[1] + margin))
@@ -97,7 +99,7 @@ class ProbeState:
         for name, dtype, size in (
             ("radiance", wp.uint32, texels),
             ("surfels", wp.uint32, texels),
-            ("nearest", wp.float32, (settings.resolution // int(field_kernels.BLOCK)) ** 2),
+            ("nearest", wp.float32, (self.resolution // int(field_kernels.BLOCK)) ** 2),
             ("irradiance", wp.vec3, settings.irradiance_resolution**2),
             ("moments", wp.vec2, settings.irradiance_resolution**2),
         ):
@@ -172,7 +174,7 @@ class ProbeState:
         launch.launch(kernel, count, inputs, self.device, smallest_slice=1)
 
     def _work(self, probes: np.ndarray, rays: int, scene: Any, with_emission: bool) -> Any:
-        texels, count = self.settings.resolution**2, len(probes)
+        texels, count = self.resolution**2, len(probes)
         work = bake_kernels.ProbeWork()
         work.probes = self._array(probes.astype(np.int32), wp.int32)
         work.rays = rays
@@ -183,10 +185,10 @@ class ProbeState:
             setattr(work, name, wp.empty(count * texels, dtype=wp.uint32, device=self.device))
         work.emission = wp.empty(count * texels * with_emission, dtype=wp.uint32, device=self.device)
         work.back = wp.empty(count * texels, dtype=wp.uint8, device=self.device)
-        work.light_low = math.gcd(LIGHT_RESOLUTION, self.settings.resolution)
+        work.light_low = math.gcd(LIGHT_RESOLUTION, self.resolution)
         work.light_directions = self._array(low_directions(work.light_low), wp.vec4)
         work.light = wp.empty(count * work.light_low**2, dtype=wp.vec3, device=self.device)
-        work.distance_low = math.gcd(DISTANCE_RESOLUTION, self.settings.resolution)
+        work.distance_low = math.gcd(DISTANCE_RESOLUTION, self.resolution)
         work.distance_directions = self._array(low_directions(work.distance_low), wp.vec4)
         work.distances = wp.empty(count * work.distance_low**2, dtype=wp.vec2, device=self.device)
         return work
@@ -194,13 +196,13 @@ class ProbeState:
     def _trace(
         self, data: Any, work: Any, probes: np.ndarray, told: Callable[[float], None] = lambda share: None
     ) -> None:
-        texels = self.settings.resolution**2
+        texels = self.resolution**2
         step = max(1, BATCH_TEXELS // texels)
         for start in range(0, len(probes), step):
             part = _part(work, start, min(start + step, len(probes)), texels)
             self._launch(bake_kernels.trace_texels, len(part.probes) * texels, [data, self.field, part])
             told((start + len(part.probes)) / len(probes))
-        blocks = (self.settings.resolution // int(field_kernels.BLOCK)) ** 2
+        blocks = (self.resolution // int(field_kernels.BLOCK)) ** 2
         self._launch(bake_kernels.find_nearest, len(probes) * blocks, [self.field, work])
         self._launch(bake_kernels.reduce_distances, len(probes) * work.distance_low**2, [self.field, work])
         size = self.settings.irradiance_resolution**2
@@ -210,8 +212,8 @@ class ProbeState:
         """Let light bounce once, and set the radiance of all texels if it is for the last time."""
         work.is_last = int(is_last)
         shared = LAST_SHARING_RESOLUTION if is_last else SHARING_RESOLUTION
-        scale = self.settings.resolution // work.light_low
-        side = math.gcd(scale, max(self.settings.resolution // shared, 1))
+        scale = self.resolution // work.light_low
+        side = math.gcd(scale, max(self.resolution // shared, 1))
         self._launch(bake_kernels.bounce, count * work.light_low**2, [self.field, work, side])
         size = self.settings.irradiance_resolution**2
         self._launch(bake_kernels.filter_light, count * size, [self.field, work])
@@ -232,7 +234,7 @@ class ProbeState:
         """Keep the radiance of texels that see an emitter, by their index."""
         if work.emission.shape[0] == 0:
             return
-        probes, size = work.probes.numpy(), self.settings.resolution**2
+        probes, size = work.probes.numpy(), self.resolution**2
         found = work.emission.numpy()
         slots = np.flatnonzero(found)
         texels, emission = self.field.emission_texels.numpy(), self.field.emission.numpy()
@@ -260,7 +262,7 @@ class ProbeState:
         counts = {
             "probes": self.grid.probe_count,
             "covered": int((arrays["states"] != 0).sum()),
-            "rays": self.grid.probe_count * settings.resolution**2 * settings.rays,
+            "rays": self.grid.probe_count * self.resolution**2 * settings.rays,
             "bytes": self.nbytes,
             **{f"change_{number + 1}": change for number, change in enumerate(self.changes)},
         }
@@ -276,7 +278,7 @@ class ProbeState:
         self.changes = bounce_changes(bake)
         work = bake_kernels.ProbeWork()
         work.probes = self._array(np.arange(self.grid.probe_count, dtype=np.int32), wp.int32)
-        blocks = (self.settings.resolution // int(field_kernels.BLOCK)) ** 2
+        blocks = (self.resolution // int(field_kernels.BLOCK)) ** 2
         self._launch(bake_kernels.find_nearest, self.grid.probe_count * blocks, [field, work])
 
     @property
@@ -291,6 +293,11 @@ def bounce_changes(bake: Bake) -> list[float]:
     """Return by how much each bounce changed the irradiance of probes, as a share of it; the first is 1."""
     count = sum(name.startswith("change_") for name in bake.counts)
     return [float(bake.counts[f"change_{number + 1}"]) for number in range(count)]
+
+
+def baked_resolution(bake: Bake) -> int:
+    """Return the texels along a side of a probe's map in a bake."""
+    return math.isqrt(len(bake.arrays["surfels"]) // len(bake.arrays["positions"]))
 
 
 def sky_bytes(scene: Any) -> np.ndarray:
