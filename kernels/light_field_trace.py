@@ -119,10 +119,12 @@ def seen_light(
     cage = cage_of(field, at)
     uv = octahedral_encode(normal)
     weights = float(0.0)
+    around = float(0.0)
     corners = int(8)
     for corner in range(corners):
         probe = cage_probe(field, cage, corner)
         weight = blend_weight(field, cage, corner, at, position, normal)
+        around += weight
         if weight > 0.0:
             if visibility == VISIBILITY_EXACT:
                 if bvh_occluded(scene.bvh, origin, field.positions[probe] - origin, 1.0):
@@ -133,7 +135,9 @@ def seen_light(
             r.irradiance = r.irradiance + probe_irradiance(field, probe, uv) * weight
             weights = weights + weight
             r.probes += 1
-    if weights > 0.0:
+    if weights <= around * field.least_seen:
+        r.probes = 0
+    elif weights > 0.0:
         r.irradiance = r.irradiance / weights
     return r
 

@@ -25,12 +25,12 @@ from warp_gi.techniques.baselines import sky_probability
 
 AUTOMATIC_PROBES = 440
 """Most that there are where neither counts nor spacing are given."""
-FEWER_PROBES = 128
-"""The same in rooms, and where no camera says what is looked at."""
+ROOM_PROBES, UNSEEN_PROBES = 80, 128
+"""The same in rooms, where more of them come out darker (`bench/NOTES.md`), and where no camera says what is seen."""
 ROOM_SHARE = 0.06
 """A camera is in a room if fewer of the ways from what it sees, and on from there, lead out of the scene."""
 FEW_RESOLUTION, MANY_RESOLUTION = 128, 64
-"""Texels along a side of a map unless told: of up to ``FEWER_PROBES`` probes, and of more."""
+"""Texels along a side of a map unless told: of up to ``UNSEEN_PROBES`` probes, and of more."""
 AUTOMATIC_STEPS = 12
 """Distances between probes along the longest side of the box, if that does not make too many of them."""
 REACH_PATHS, REACH_CAMERAS, LEAST_REACHED = 40_000, 32, 400
@@ -119,14 +119,15 @@ def place_grid(scene: Any, settings: Any, camera: Camera | CameraPath | None, de
     """
     seen = seen_space(scene, cameras_of(camera) or list(scene.cameras.values()), device)
     if seen is None:
-        seen = Space(lit_bounds(scene, device), 0.0)
-    most = AUTOMATIC_PROBES if seen.leaving > ROOM_SHARE else FEWER_PROBES
-    return probe_grid(seen.bounds, settings.counts, settings.spacing, settings.largest_map, most)
+        box, most = lit_bounds(scene, device), UNSEEN_PROBES
+    else:
+        box, most = seen.bounds, ROOM_PROBES if seen.leaving < ROOM_SHARE else AUTOMATIC_PROBES
+    return probe_grid(box, settings.counts, settings.spacing, settings.largest_map, most)
 
 
 def map_resolution(resolution: int, probes: int) -> int:
     """Return the texels along a side of a map that a setting of ``resolution`` means for so many probes."""
-    return resolution or (FEW_RESOLUTION if probes <= FEWER_PROBES else MANY_RESOLUTION)
+    return resolution or (FEW_RESOLUTION if probes <= UNSEEN_PROBES else MANY_RESOLUTION)
 
 
 def cameras_of(camera: Camera | CameraPath | None) -> list[Camera]:

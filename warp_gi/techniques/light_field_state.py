@@ -26,6 +26,9 @@ BIAS = 0.05
 """Share of the smallest distance between probes by which a point leaves its surface before it asks who sees it."""
 COVERED_SHARE = 0.5
 """A probe that sees back faces in more directions than this is inside of something."""
+LEAST_SEEN = 0.25
+"""Of the weights of the probes around a point, the share of those that see it, from which on its light is known: in
+niches and under stairs fewer do, and what they know is the light in front."""
 BATCH_TEXELS = 1 << 20
 """Traced between two reports of progress."""
 
@@ -92,6 +95,7 @@ class ProbeState:
         field.counts = wp.vec3i(*grid.counts)
         field.resolution, field.irradiance_resolution = self.resolution, settings.irradiance_resolution
         field.bias = BIAS * float(grid.spacing.min())
+        field.least_seen = LEAST_SEEN
         field.plain = int(settings.weights == "trilinear")
         field.bounds_low, field.bounds_high = wp.vec3(*(bounds[0] - margin)), wp.vec3(*(bounds[1] + margin))
         field.positions = self._array(grid.positions().astype(np.float32), wp.vec3)
