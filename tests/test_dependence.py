@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import statistics_tools as st
 
@@ -154,17 +155,6 @@ CASES = {
     "denoised": Case("unsaved", preset("path", denoise="spatiotemporal"), moving=True),
     "reuse, probes": Case("unsaved", preset("reuse", indirect=PROBES), turning=True),
 }
-QUICK = (
-    "hierarchy",
-    "dvf",
-    "dvf moving",
-    "dvf budget still",
-    "dvf relight",
-    "hybrid moving",
-    "probes",
-    "probes moving",
-)
-EVERY = [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in CASES]
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +204,7 @@ def test_an_estimator_that_preprocesses_or_learns_depends_on_the_past_unless_it_
     assert scheduler.dependence().unsaved == ("environment",)
 
 
-@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.parametrize("name", CASES)
 def test_frames_keep_what_their_pipeline_says(name, wholes):
     """Whole on two threads; if independent each frame alone and in reverse; if saved after a break at every frame."""
     case = CASES[name]
@@ -241,6 +231,32 @@ def test_frames_keep_what_their_pipeline_says(name, wholes):
         launch.set_threads(None)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("turning", [False, True], ids=["one sky", "turning"])
+@pytest.mark.parametrize("moving", [False, True], ids=["still", "moving"])
+@pytest.mark.parametrize("name", CASES)
+def test_every_frame_alone_and_every_break(name, moving, turning, tmp_path):
+    """In processes of their own, as far as that goes; after a break to the end; on 1, 2 and 3 threads by turns."""
+    case = replace(CASES[name], moving=moving, turning=turning and not CASES[name].alone)
+    whole = case.begin()
+    says, frames = whole.says, []
+    for index in range(FRAMES):
+        frames.append(whole.frame(index))
+        whole.scheduler.save_state(tmp_path / str(index), "past")
+    try:
+        for index in range(FRAMES):
+            launch.set_threads(1 + index % 3)
+            if says == "":
+                assert_same(case.begin().frame(index), frames[index], f"frame {index} alone")
+            run = case.begin()
+            if says == "saved":
+                run.scheduler.load_state(tmp_path / str(index), "past")
+            for number in range(index + 1 if says == "saved" else 0, FRAMES):
+                assert_same(run.frame(number), frames[number], f"frame {number} after a break at {index}")
+    finally:
+        launch.set_threads(None)
+
+
 def other_scheduler(run):
     """Return a new scheduler of a scene that has been rendered already, which stands as the last frame left it."""
     old = run.scheduler
@@ -263,6 +279,18 @@ def test_states_load_into_a_run_that_went_on(wholes):
     other.scheduler._bake_digests = run.scheduler._bake_digests
     with pytest.raises(BakeError, match="began with other cells"):
         other.scheduler.load_state(states[0][0], "past")
+
+
+def test_what_a_cell_gets_does_not_depend_on_the_pose_in_which_baking_began():
+    """Samples are as dense as the scene's area at time 0 says, though an object grows."""
+    densities = []
+    for time in (0.0, 0.5):
+        scene = yard(True)
+        scene.animate("plate", [gi.Keyframe(0.0, scale=(1.0, 1.0, 1.0)), gi.Keyframe(0.5, scale=(3.0, 3.0, 3.0))])
+        scene.update(time, None, st.device())
+        state = FIELD.start(scene, st.device().alias, None)
+        densities.append([state.baker(layer).density for layer in ("lasting", "at rest")])
+    assert densities[0] == densities[1] and densities[0][0] == densities[0][1] > 0
 
 
 # ---- interrupts ----
@@ -311,18 +339,16 @@ def interrupts(case, index, at, monkeypatch):
 
 
 STOPPED = ("dvf moving", "dvf budget still", "dvf relight", "reuse moving", "probes moving", "denoised")
-QUICK_STOPS = ("dvf budget still", "reuse moving", "probes moving")
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in QUICK_STOPS else pytest.mark.slow) for name in STOPPED]
-)
+@pytest.mark.parametrize("name", STOPPED)
 def test_an_interrupted_frame_leaves_nothing_behind(name, wholes, monkeypatch):
     """Stopped after its last launch, and after one while it traces: rendered again, and the next, as if it was not."""
     _, frames, states = wholes(name)
     for index, at in ((1, -1), (3, -3)):
         run = interrupts(CASES[name], index, at, monkeypatch)
         assert run is not None
+        assert run.scheduler._records is None  # slices of a launch that was stopped may still write there
         for number in (index, index + 1):
             assert_same(run.frame(number), frames[number], f"frame {number}, stopped in {index} at {at}")
             assert_same(run.state(), states[number][1], f"state {number}, stopped in {index} at {at}")
@@ -338,22 +364,22 @@ def test_a_frame_may_be_interrupted_anywhere(name, wholes, monkeypatch):
             assert_same(run.frame(3), frames[3], f"frame 3, stopped at {at}")
 
 
-def test_a_scene_interrupted_while_it_moves_is_placed_anew(monkeypatch):
-    """Also for the pose that it was in before."""
-    from warp_gi.bvh import TriangleBvh
-
+@pytest.mark.parametrize("then", [0, 1])
+@pytest.mark.parametrize("stopped", ["warp_gi.scene.geometry.place", "warp_gi.bvh.TriangleBvh.refit"])
+def test_a_scene_interrupted_while_it_moves_is_placed_anew(stopped, then, wholes, monkeypatch):
+    """For the pose that it was to have, and for that it had before."""
     case = CASES["hierarchy"]
     run = case.begin()
-    before = run.frame(0)
+    run.frame(0)
 
-    def stops(self, points):
+    def stops(*arguments):
         raise Stop
 
-    monkeypatch.setattr(TriangleBvh, "refit", stops)
+    monkeypatch.setattr(stopped, stops)
     with pytest.raises(Stop):
         run.frame(1)
     monkeypatch.undo()
-    assert_same(run.frame(0), before, "frame 0")
+    assert_same(run.frame(then), wholes("hierarchy")[1][then], f"frame {then}")
 
 
 # ---- the command ----
@@ -394,16 +420,24 @@ def test_a_growing_field_is_resumed_to_the_same_pictures(tmp_path, capsys):
         assert_same(exr(pattern, index), whole[index], f"frame {index} beside one made alone")
 
 
-@pytest.mark.parametrize("extra", [["--pipeline=path", "--denoise=spatiotemporal"]], ids=["denoised"])
-def test_frames_made_apart_are_not_taken_for_a_sequence(extra, tmp_path, capsys):
+@pytest.mark.parametrize("kind", ["denoised", "probes"])
+def test_frames_made_apart_are_not_taken_for_a_sequence(kind, tmp_path, capsys):
     """Where a frame depends on those before, its file says which: also if every file is there."""
     pattern, apart = tmp_path / "a.####.exr", tmp_path / "b.####.exr"
-    command = ["render", "cornell_box", "--spp=2", "--resolution=24x16", *extra]
+    command = ["render", "cornell_box", "--spp=2", "--resolution=24x16"]
+    if kind == "denoised":
+        command, what = [*command, "--pipeline=path", "--denoise=spatiotemporal"], "the denoiser"
+    else:  # which are filled under the sky of the first frame, and stay so
+        oiio.ImageBuf(sky().pixels).write(str(tmp_path / "sky.exr"))
+        command += [f"--environment={tmp_path}/sky.exr", "--environment-turn=40", "--pipeline=probes"]
+        command += ["--indirect.update=0", "--indirect.counts", "2", "2", "2", "--indirect.resolution=16"]
+        what = "the indirect light"
     assert cli.main([*command, "--frames=0-2", "--quiet", "-o", str(pattern)]) == 0
     for frames in ("0-1", "2"):
         assert cli.main([*command, f"--frames={frames}", "--quiet", "-o", str(apart)]) == 0
+    assert any(not np.array_equal(exr(apart, 2)[name], exr(pattern, 2)[name]) for name in ("beauty", "indirect"))
     capsys.readouterr()
     assert cli.main([*command, "--frames=0-2", "--resume", "-o", str(apart)]) == 0
-    assert "the denoiser depends on the frames before" in capsys.readouterr().out
+    assert f"{what} depends on the frames before" in capsys.readouterr().out
     for index in range(3):
         assert_same(exr(apart, index), exr(pattern, index), f"frame {index}")

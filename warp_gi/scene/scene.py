@@ -387,10 +387,10 @@ class _DeviceScene:
             changed |= not np.array_equal(table, self.emitters)
             self.emitters[:] = table
             self._upload(self.data.emitters.emitters, self.emitters, len(self.scene._emissive), len(self.emitters))
-        self.world, self.previous_world = world, previous_world
         if moved:
             self.bvh.refit(flat.points)
             self._bound_emitters(self.data.emitters)
+        self.world, self.previous_world = world, previous_world
         return moved or changed
 
     def _bound_emitters(self, target: types.Emitters) -> None:
