@@ -352,6 +352,9 @@ def test_an_interrupted_frame_leaves_nothing_behind(name, wholes, monkeypatch):
         for number in (index, index + 1):
             assert_same(run.frame(number), frames[number], f"frame {number}, stopped in {index} at {at}")
             assert_same(run.state(), states[number][1], f"state {number}, stopped in {index} at {at}")
+    run, other = interrupts(CASES[name], 1, -1, monkeypatch), CASES[name].begin()
+    other.frame(0)
+    assert_same(run.frame(0), other.frame(0), "frame 0 again, stopped in frame 1")
 
 
 @pytest.mark.slow
