@@ -89,7 +89,7 @@ class Run:
         None for denoisers over frames too, as those share their noise.
         """
         denoise = self.pipeline.denoise
-        if self.count < 2 or (denoise is not None and denoise.remembers):
+        if self.count < 2 or (denoise is not None and denoise.depends_on_past()):
             return None
         if reference.noise is not None and reference.noise > self.points[-1].rmse:
             return None  # relative errors are over a picture that is wrong itself, and would pass for a floor

@@ -407,7 +407,10 @@ def test_probes_that_follow_a_turning_sky_are_resumed_from_the_start(probes, sky
     small = ["cornell_box", f"--environment={sky}", "--resolution=24x16", "--spp=1", "--pipeline=probes", *of_render]
     still = ["render", *small, "--indirect.mode=irradiance", "--frames=0-2", "--bake", str(path)]  # of another sky
     for command, told in (
-        ([*still, "--environment-turn=30"], "every frame is rendered again: the indirect light follows what changes"),
+        (
+            [*still, "--environment-turn=30"],
+            "again: the indirect light depends on the frames before",
+        ),
         (still, "2 of 3 frames are there already"),
     ):
         pattern = tmp_path / str(len(command)) / "a.####.exr"

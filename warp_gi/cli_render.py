@@ -38,6 +38,7 @@ from warp_gi.sequence import (
     write_frame,
     write_preview,
 )
+from warp_gi.sequence_state import Dependence
 from warp_gi.techniques.reuse_pictures import check_pictures, reuse_pictures
 
 DESCRIPTION = """Render a sequence of frames to EXR files with named layers, and PNG previews.
@@ -116,7 +117,7 @@ class Shot:
     camera: Camera
     previous_camera: Camera
     lineage: str = ""
-    """Hash of all that decides this frame and those before it, where light is learnt from them."""
+    """Hash of all that decides this frame and those before it, where it depends on them."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -216,21 +217,20 @@ def run(options: Render, report: Reporter) -> None:
         check_pictures(scheduler, shots[-1].camera, options.reuse_pixel)
     with report.phase("bake"):
         scheduler.bake()
+    dependence = scheduler.dependence([shot.index for shot in shots], sky_changes=bool(options.environment_turn))
     done, before = [], ""
     for shot in shots:
-        if options.resume or scheduler.learns:
+        if options.resume or dependence.on_past:
             turn_sky(options, scene, sky, shot.index)  # what the frame's file has to say
-        if scheduler.learns:
+        if dependence.on_past:
             before = shot.lineage = lineage(options, shot, scheduler, before)
         done.append(options.resume and is_done(options, shot, scheduler, report))
     todo = [shot for shot, is_there in zip(shots, done, strict=True) if not is_there]
-    if todo and any(done):
-        reason = what_remembers(options, scene)
-        if reason or scheduler.learns:
-            todo = shots if reason else shots[known_frames(options, scheduler, shots[: done.index(False)]) :]
+    if todo and any(done) and dependence.on_past:
+        whole = shots[: done.index(False)] if dependence.is_saved else []
+        todo = shots[known_frames(options, scheduler, whole) :]
         if len(todo) == len(shots):
-            reason = reason or "no saved state fits, and light is learnt"
-            report.line(f"every frame is rendered again: {reason} by the frames before")
+            report.line(why_all(dependence))
     if options.reuse_pictures is not None:
         if not todo:
             raise OptionError("--reuse-pictures needs a frame to render, and all are there already; leave --resume out")
@@ -249,7 +249,7 @@ def run(options: Render, report: Reporter) -> None:
                 frame, stages = render_shot(options, shot, scheduler, report)
                 for stage, seconds in stages.items():
                     times.setdefault(stage, []).append(seconds)
-                if scheduler.learns and shot.path.suffix.lower() == ".exr":  # nothing resumes from others
+                if dependence.is_saved and shot.path.suffix.lower() == ".exr":  # nothing resumes from others
                     saving = time.perf_counter()
                     scheduler.save_state(state_path(options), shot.lineage)
                     times.setdefault("save state", []).append(time.perf_counter() - saving)
@@ -276,7 +276,7 @@ def render_shot(
     remove_stale_parts(shot.path)
     started, compiled = time.perf_counter(), launch.compile_seconds
     frame = scheduler.frame(shot.index, shot.previous)
-    if scheduler.learns:
+    if shot.lineage:
         frame.metadata["lineage"] = shot.lineage
     rendered = time.perf_counter()
     write_shot(options, frame, shot.path)
@@ -373,21 +373,20 @@ def known_frames(options: Render, scheduler: FrameScheduler, whole: list[Shot]) 
     return lineages.index(known) + 1
 
 
-def what_remembers(options: Render, scene: Scene | BakedScene) -> str:
-    """Return what makes a frame depend on those before it in a way that no file keeps, or nothing."""
-    settings = options.settings
-    if settings.denoise is not None and settings.denoise.remembers:
-        return "the denoiser goes"
-    if scene.is_animated or options.environment_turn:
-        for term, estimator in settings.estimators():
-            if estimator.remembers:
-                return f"the {term} light follows what changes"
-    return ""
+def why_all(dependence: Dependence) -> str:
+    """Return why every frame is rendered again where some are there already."""
+    lights = {"denoiser": "the denoiser"}
+    names = [lights.get(name, f"the {name} light") for name in dependence.unsaved or dependence.on_past]
+    reason = "" if dependence.unsaved else "no saved state fits, and "
+    return (
+        f"every frame is rendered again: {reason}{' and '.join(names)} depend{'s' * (len(names) == 1)} "
+        "on the frames before"
+    )
 
 
 def is_done(options: Render, shot: Shot, scheduler: FrameScheduler, report: Reporter) -> bool:
     """Return whether the frame's file is whole and made with the same settings; adds a missing preview."""
-    metadata = scheduler.metadata() | ({"lineage": shot.lineage} if scheduler.learns else {})
+    metadata = scheduler.metadata() | ({"lineage": shot.lineage} if shot.lineage else {})
     expected = frame_attributes(shot.index, shot.time, shot.camera, metadata, shot.previous_camera, options.precision)
     problem = why_not_whole(shot.path, expected, shot.camera)
     if problem is None:

@@ -28,19 +28,21 @@ class Denoiser:
     """Base of every denoiser; a frozen dataclass of plain settings.
 
     ``start`` makes the state before the first frame, ``apply`` fills a frame's ``beauty`` and returns the
-    state for the next frame. A denoiser keeps nothing anywhere but in its state.
+    state for the next frame, leaving the last one as it is. A denoiser keeps nothing anywhere but in its state.
     """
 
     wants_lobes: ClassVar[bool] = False
     """Whether ``apply`` reads the guides and the separated light (``Frame.lobes``)."""
-    remembers: ClassVar[bool] = False
-    """Whether a frame depends on the frames before it."""
 
     def __post_init__(self) -> None:
         self.validate()
 
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
+
+    def depends_on_past(self) -> bool:
+        """Return whether a frame depends on those before it; True, unless a denoiser promises that it does not."""
+        return True
 
     def start(self, device: wp.Device) -> Any:
         """Return the state before the first frame; raises OptionError if something is not installed."""
@@ -88,7 +90,6 @@ class SpatioTemporal(Denoiser):
     """
 
     wants_lobes: ClassVar[bool] = True
-    remembers: ClassVar[bool] = True
 
     diffuse_radius: int = 12
     """Pixels to each side. 0 is no filter over pixels."""
@@ -208,6 +209,10 @@ class Oidn(Denoiser):
         """Raise OptionError for an unknown quality."""
         if self.quality not in QUALITIES:
             raise unknown_name("quality", self.quality, QUALITIES)
+
+    def depends_on_past(self) -> bool:
+        """Return False: the state is the library."""
+        return False
 
     def start(self, device: wp.Device) -> Any:
         """Return the library; raises OptionError where it is not installed."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from warp_gi.baking import Bake
     from warp_gi.camera import Camera, CameraPath
@@ -23,12 +23,25 @@ class SamplerInUse(NamedTuple):
 
 
 @dataclass(frozen=True)
+class Ahead:
+    """What is known of a sequence before its first frame."""
+
+    state: Any
+    """The estimator's, before the first frame."""
+    views: Sequence[tuple[int, Camera]]
+    """The frames that will be rendered, by number, and from where."""
+    sky_changes: bool = False
+    """Whether the scene gets another sky from frame to frame."""
+
+
+@dataclass(frozen=True)
 class Estimator:
     """Base of every estimator of one term of the light; a frozen dataclass of plain settings.
 
     What can be known before the first frame is a ``Bake``, which can be saved; ``start`` makes
     the first state of it, ``preprocess`` the state of each frame, and ``trace`` is called once for
-    each camera sample. An estimator keeps nothing anywhere but in its state.
+    each camera sample. An estimator keeps nothing anywhere but in its state, and leaves the previous state as it is,
+    arrays included: a frame that is interrupted is rendered again from there.
     """
 
     term: ClassVar[str]
@@ -39,10 +52,23 @@ class Estimator:
         """Whether the estimator finds out what the camera sees, too: then it is the only one of its pipeline."""
         return False
 
+    def depends_on_past(self, scene: Scene, ahead: Ahead | None = None) -> bool:
+        """Return whether a frame depends on those rendered before it: yes, if it has a ``preprocess`` or learns.
+
+        An override may say no. That is a promise: a frame rendered alone, or after a break, or after any others is
+        the same to the last bit. ``ahead`` None asks for every camera, sky and state that there may be.
+        """
+        kind = type(self)
+        overrides = kind.preprocess is not Estimator.preprocess or kind.learn is not Estimator.learn
+        return self.learns or overrides
+
     @property
-    def remembers(self) -> bool:
-        """Whether frames depend on those before, if the scene or its sky changes."""
-        return False
+    def saves_state(self) -> bool:
+        """Whether a saved state holds all that frames before left, so that a sequence goes on from it bit for bit.
+
+        If not, a sequence whose frames depend on the past is rendered from its first frame again.
+        """
+        return self.learns
 
     @property
     def learns(self) -> bool:
@@ -85,7 +111,7 @@ class Estimator:
         return None
 
     def preprocess(self, frame: Frame, state: Any) -> Any:
-        """Return the state for this frame, from the scene's changes and the previous state."""
+        """Return the state for this frame, from the scene's changes and the previous state, which stays as it is."""
         return state
 
     def trace_primary(self, frame: Frame, state: Any) -> None:

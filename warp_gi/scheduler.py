@@ -19,12 +19,12 @@ from warp_gi import launch
 from warp_gi.baking import Bake, load_bake
 from warp_gi.camera import Camera, CameraPath
 from warp_gi.errors import BakeError, OptionError, unknown_name
-from warp_gi.estimator import Estimator, SamplerInUse
+from warp_gi.estimator import Ahead, Estimator, SamplerInUse
 from warp_gi.kernels import compose, denoise, gbuffer, path_samplers, path_trace, path_tracers, samples, types
 from warp_gi.pipeline import TERMS, Pipeline
 from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.scene import Scene
-from warp_gi.sequence_state import state_arrays, with_arrays
+from warp_gi.sequence_state import Dependence, state_arrays, with_arrays
 from warp_gi.techniques.baselines import BsdfPaths, PowerLights, sky_probability
 
 MOST_VERTICES = 12  # of a path whose samples are kept; few paths get further, and each has room for as many
@@ -317,65 +317,90 @@ class FrameScheduler:
         return self._states[term]
 
     def frame(self, index: int, previous_index: int | None = None) -> Frame:
-        """Render frame ``index``; motion is towards frame ``previous_index`` (None: the frame before it, if any)."""
+        """Render frame ``index``; motion is towards frame ``previous_index`` (None: the frame before it, if any).
+
+        A frame that an exception interrupts leaves nothing behind: what is rendered next is as if it had not begun.
+        """
         self.bake()
         if previous_index is None:
             previous_index = max(index - 1, 0)
         frame = self._new_frame(index, previous_index)
+        states, records, self._records = dict(self._states), self._records, None
         for term, estimator in self._estimators.items():
             with frame.stage(f"preprocess {term}"):
-                self._states[term] = estimator.preprocess(frame, self._states[term])
+                states[term] = estimator.preprocess(frame, states[term])
         if self._light_sampler is not None:
-            self._states["lights"] = self._light_sampler.preprocess(frame, self._states.get("lights"))
+            states["lights"] = self._light_sampler.preprocess(frame, states.get("lights"))
         learns = path_tracers.learns(frame.lights.sampler, frame.directions.sampler)  # not so without any lights
         if learns:
             with frame.stage("preprocess octree"):
-                self._open_records(frame)
+                records = self._open_records(frame, states["octree"], records)
         views = self.pipeline.camera_sample_count
         for view in range(views):
-            self._trace_view(frame, view)
+            self._trace_view(frame, view, states)
             self._progress("trace", (view + 1) / views)
         with frame.stage("compose"):
             frame.launch(compose.compose_frame, [views, self.pipeline.spp, frame.struct(compose.FrameSums)])
         if learns:
-            self._learn(frame)
+            states |= self._learnt(frame, states, records)
         if self.pipeline.denoise is not None:
             with frame.stage("denoise"):
                 frame.keep_noisy()
-                self._states["denoise"] = self.pipeline.denoise.apply(frame, self._states["denoise"])
+                states["denoise"] = self.pipeline.denoise.apply(frame, states["denoise"])
+        self._states, self._records = states, records  # all or nothing
         return frame
 
-    def _open_records(self, frame: Frame) -> None:
-        """Let the paths of a frame find regions, and leave samples."""
+    def _open_records(self, frame: Frame, octree: Any, previous: samples.SampleRecords | None) -> samples.SampleRecords:
+        """Let the paths of a frame find regions, and return where they leave samples; ``previous`` is used again."""
         indirect = self.pipeline.indirect
         vertices = min(indirect.max_depth - 1, MOST_VERTICES) if isinstance(indirect, BsdfPaths) else 1
         data = samples.SampleRegions()
-        data.octree, data.moves = self._states["octree"].octree, int(self.scene.is_animated)
-        data.records = self._records = self.pipeline.octree.records(frame, vertices, self._records)
+        data.octree, data.moves = octree.octree, int(self.scene.is_animated)
+        data.records = self.pipeline.octree.records(frame, vertices, previous)
         frame.regions = SamplerInUse(samples.SAMPLE_REGIONS, data)
+        return data.records
 
-    def _learn(self, frame: Frame) -> None:
-        """Let every technique that learns take over what the samples of a frame say."""
+    def _learnt(self, frame: Frame, states: dict[str, Any], records: samples.SampleRecords | None) -> dict[str, Any]:
+        """Return the states of every technique that learns, after what the samples of a frame say."""
         with frame.stage("learn octree"):
-            lesson = self.pipeline.octree.learn(self._states["octree"], self._records, self.device)
+            lesson = self.pipeline.octree.learn(states["octree"], records, self.device)
         learnt = {"octree": lesson.octree}
         for term in self._learners:
             with frame.stage(f"learn {term}"):
-                learnt[term] = self._estimators[term].learn(lesson, self._states[term])
-        self._states |= learnt  # all or nothing: leaves of one tree have no place in the tables of another
+                learnt[term] = self._estimators[term].learn(lesson, states[term])
+        return learnt
 
     @property
     def learns(self) -> bool:
-        """Whether an estimator learns from the frames, so that there is a state to save."""
+        """Whether an estimator learns from the samples of frames."""
         return bool(self._learners)
+
+    def dependence(self, frames: Iterable[int] | None = None, sky_changes: bool = False) -> Dependence:
+        """Return how ``frames`` (None: every one of the camera's path) depend on those rendered before them.
+
+        ``sky_changes`` says that the scene gets another environment on the way.
+        """
+        self.bake()
+        if frames is None:
+            frames = range(self.camera.frame_count if isinstance(self.camera, CameraPath) else 4)
+        views = [(index, self._camera_at(index)) for index in frames]
+        depends = {
+            term: estimator.depends_on_past(self.scene, Ahead(self._states[term], views, sky_changes))
+            for term, estimator in self._estimators.items()
+        }
+        on_past = [term for term in depends if depends[term]]
+        unsaved = [term for term in on_past if not self._estimators[term].saves_state]
+        if self.pipeline.denoise is not None and self.pipeline.denoise.depends_on_past():
+            on_past, unsaved = [*on_past, "denoiser"], [*unsaved, "denoiser"]
+        return Dependence(tuple(on_past), tuple(unsaved))
 
     def save_state(self, path: str | Path, lineage: str = "") -> Path:
         """Write what is known after the last frame, whole or not at all: ``load_state`` goes on from there.
 
-        What is saved is what estimators that learn from samples have learnt. ``lineage`` names the frames that it
-        was learnt from. Raises OSError when the file cannot be written.
+        What is saved is what estimators with ``saves_state`` keep from frame to frame; ``dependence`` says whether that
+        is all that there is. ``lineage`` names the frames before. Raises OSError when the file cannot be written.
         """
-        return self._saved_state(lineage, state_arrays(self._learnt())).save(path)
+        return self._saved_state(lineage, state_arrays(self._to_save())).save(path)
 
     def load_state(self, path: str | Path, lineage: str = "") -> None:
         """Go on from a file of ``save_state``, as if the frames before had been rendered here: bit for bit.
@@ -386,13 +411,14 @@ class FrameScheduler:
         saved, wanted = load_bake(path), self._saved_state(lineage, {})
         try:
             saved.check(wanted.technique, wanted.scene_key, wanted.settings, wanted.scene_name)
-            self._states |= with_arrays(self._learnt(), saved.arrays, self.device)
+            self._states = self._states | with_arrays(self._to_save(), saved.arrays, self.device)
         except (BakeError, KeyError, ValueError, RuntimeError) as error:
             raise BakeError(f"{path}: is not the state of this sequence ({error}); delete it") from error
 
-    def _learnt(self) -> dict[str, Any]:
+    def _to_save(self) -> dict[str, Any]:
         self.bake()
-        return {name: self._states[name] for name in (["octree"] * bool(self._learners)) + self._learners}
+        names = [term for term, estimator in self._estimators.items() if estimator.saves_state]
+        return {name: self._states[name] for name in ["octree"] * bool(self._learners) + names}
 
     def _saved_state(self, lineage: str, arrays: dict[str, np.ndarray]) -> Bake:
         """Return a file's contents; the sky may differ from that of the frame before."""
@@ -440,7 +466,7 @@ class FrameScheduler:
     def _camera_at(self, index: int) -> Camera:
         return self.camera.camera(index) if isinstance(self.camera, CameraPath) else self.camera
 
-    def _trace_view(self, frame: Frame, view: int) -> None:
+    def _trace_view(self, frame: Frame, view: int, states: dict[str, Any]) -> None:
         pipeline, settings = self.pipeline, frame.pass_settings
         views = pipeline.camera_sample_count
         settings.seed = frame.seed
@@ -454,7 +480,7 @@ class FrameScheduler:
         for term, estimator in self._estimators.items():
             if estimator.makes_primary:
                 with frame.stage("primary"):
-                    estimator.trace_primary(frame, self._states[term])
+                    estimator.trace_primary(frame, states[term])
                 return
         with frame.stage("primary"):
             frame.launch_tiled(gbuffer.trace_primary, [frame.data, frame.camera_data, settings, frame.hits])
@@ -464,7 +490,7 @@ class FrameScheduler:
         frame._path_terms = 0
         for term, estimator in self._estimators.items():
             with frame.stage(term):
-                estimator.trace(frame, self._states[term])
+                estimator.trace(frame, states[term])
         with frame.stage("paths"):
             frame.launch_paths()
 
@@ -489,7 +515,8 @@ def render(
         frames: Frame numbers in order; None is every frame of the path.
         device: "cpu", "cuda", "cuda:1".
         seed: Every random number follows from it, the frame, the pixel and the sample.
-        skip: Frames that need not be rendered, because they exist already. What learns from frames does not see them.
+        skip: Frames that need not be rendered, because they exist already. What depends on frames before
+            (``FrameScheduler.dependence``) does not see them.
         progress: Called with (stage, share done in [0, 1]).
         bakes: Bakes made before (``gi.bake``, ``gi.load_bake``), each for the estimator that it names.
 

@@ -1,13 +1,14 @@
 """What a sequence knows between two frames, as plain arrays: to be saved, and to go on from in another process.
 
 States are dataclasses and kernel structs of arrays. Only arrays are saved; all else, as sizes of the scene, comes from
-the state before the first frame, which is made anew.
+the state before the first frame, which is made anew. A state that knows better what there is to save has the methods
+``saved_arrays`` and ``with_saved_arrays``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,29 @@ import warp as wp
 from warp_gi.launch import copied
 
 
+@dataclass(frozen=True)
+class Dependence:
+    """How the frames of a sequence depend on those before them."""
+
+    on_past: tuple[str, ...]
+    """Terms whose estimator makes them depend, and "denoiser"."""
+    unsaved: tuple[str, ...]
+    """Those among them whose state no file keeps."""
+
+    @property
+    def is_saved(self) -> bool:
+        """Whether frames depend on those before, and a saved state holds all that they left."""
+        return bool(self.on_past) and not self.unsaved
+
+
 def state_arrays(state: Any, name: str = "") -> dict[str, np.ndarray]:
     """Return every array in a state, by the names of the fields that lead to it, joined by dots."""
     if isinstance(state, wp.array):
         return {name: state.numpy()}
     if isinstance(state, np.ndarray):
         return {name: state}
+    if hasattr(state, "saved_arrays"):
+        return {f"{name}.{key}": array for key, array in state.saved_arrays().items()}
     found: dict[str, np.ndarray] = {}
     for key, value in _parts(state):
         found |= state_arrays(value, f"{name}.{key}" if name else key)
@@ -40,6 +58,10 @@ def with_arrays(state: Any, arrays: Mapping[str, np.ndarray], device: wp.Device,
         return restored
     if isinstance(state, np.ndarray):
         return arrays[name]
+    if hasattr(state, "with_saved_arrays"):
+        prefix = f"{name}."
+        mine = {key.removeprefix(prefix): array for key, array in arrays.items() if key.startswith(prefix)}
+        return state.with_saved_arrays(mine)
     parts = {key: with_arrays(value, arrays, device, f"{name}.{key}" if name else key) for key, value in _parts(state)}
     if isinstance(state, dict):
         return parts

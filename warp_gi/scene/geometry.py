@@ -85,6 +85,13 @@ def distinct_materials(nodes: Sequence[Node]) -> list[Material]:
     return found
 
 
+def surface_area(points: np.ndarray, indices: np.ndarray) -> float:
+    """Return the area of triangles ``indices`` [n, 3] of ``points`` [m, 3], one side of each."""
+    corners = points[indices].astype(np.float64)
+    sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return float((0.5 * np.linalg.norm(sides, axis=1)).sum())
+
+
 def transform_points(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return ``points`` [n, 3] moved by ``matrix`` [4, 4], float32."""
     if np.array_equal(matrix, np.eye(4)):

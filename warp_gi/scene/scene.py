@@ -115,6 +115,11 @@ class Scene:
         return float(np.linalg.norm(self._bounds[1].astype(np.float64) - self._bounds[0])) / 2.0
 
     @property
+    def surface_area(self) -> float:
+        """Of all triangles at time 0, one side of each [m^2]."""
+        return geometry.surface_area(self._flat.points, self._flat.indices)
+
+    @property
     def object_names(self) -> list[str]:
         """Names of the nodes with meshes, by object id."""
         return [node.name for node in self.nodes if node.meshes]
@@ -356,12 +361,15 @@ class _DeviceScene:
         nodes, flat, target = self.scene.nodes, self.flat, self.data.geometry
         world = animation.world_matrices(nodes, time)
         previous_world = animation.world_matrices(nodes, previous_time)
+        before, before_previous = self.world, self.previous_world
+        # until all is moved no pose is known: the next call after an interrupt places everything
+        self.world = self.previous_world = [np.full((4, 4), np.nan)] * len(nodes)
         moved = changed = False
         for index, node in enumerate(nodes):
             start, stop = flat.vertex_starts[index : index + 2]
             if start == stop or not self.scene._moving[index]:
                 continue
-            if not np.array_equal(previous_world[index], self.previous_world[index]):
+            if not np.array_equal(previous_world[index], before_previous[index]):
                 vertex = start
                 for mesh in node.meshes:
                     end = vertex + len(mesh.points)
@@ -369,7 +377,7 @@ class _DeviceScene:
                     vertex = end
                 self._upload(target.previous_points, self.previous_points, start, stop)
                 changed = True
-            if not np.array_equal(world[index], self.world[index]):
+            if not np.array_equal(world[index], before[index]):
                 geometry.place(flat, node, world[index], start)
                 self._upload(target.points, flat.points, start, stop)
                 self._upload(target.normals, flat.normals, start, stop)
@@ -379,10 +387,10 @@ class _DeviceScene:
             changed |= not np.array_equal(table, self.emitters)
             self.emitters[:] = table
             self._upload(self.data.emitters.emitters, self.emitters, len(self.scene._emissive), len(self.emitters))
-        self.world, self.previous_world = world, previous_world
         if moved:
             self.bvh.refit(flat.points)
             self._bound_emitters(self.data.emitters)
+        self.world, self.previous_world = world, previous_world
         return moved or changed
 
     def _bound_emitters(self, target: types.Emitters) -> None:

@@ -38,6 +38,10 @@ class _SampledLights(Estimator):
         """Return relative selection probabilities, float64 [emitter_count]."""
         raise NotImplementedError
 
+    def depends_on_past(self, scene: Any, ahead: Any = None) -> bool:
+        """Return False: powers stay, so every frame has the same table."""
+        return False
+
     def preprocess(self, frame: Any, state: Any) -> Any:
         """Fill the alias table that every path vertex of the frame uses."""
         if frame.scene.emitter_count == 0:

@@ -13,7 +13,7 @@ from warp_gi import launch
 from warp_gi.baking import Bake
 from warp_gi.camera import Camera, CameraPath
 from warp_gi.errors import BakeError, OptionError, check_whole, unknown_name
-from warp_gi.estimator import Estimator
+from warp_gi.estimator import Ahead, Estimator
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_trace as trace_kernels
 from warp_gi.kernels import path_trace
@@ -173,11 +173,6 @@ class LightFieldProbes(Estimator):
     # ---- frames ----
 
     @property
-    def remembers(self) -> bool:
-        """Whether frames depend on those before, if the scene or its sky changes."""
-        return self.update > 0
-
-    @property
     def largest_map(self) -> int:
         """Texels along a side of the largest map of a probe, if there are many of them."""
         return max(map_resolution(self.resolution, MOST_PROBES), self.irradiance_resolution)
@@ -187,13 +182,19 @@ class LightFieldProbes(Estimator):
         """Whether camera rays are traced through the probes."""
         return self.primary == "probes"
 
+    def depends_on_past(self, scene: Any, ahead: Ahead | None = None) -> bool:
+        """Return whether the sky changes, as probes begin with that of the first frame, or they follow what moves."""
+        return ahead is None or ahead.sky_changes or (self.update > 0 and scene.is_animated)
+
     def preprocess(self, frame: Any, state: ProbeState) -> ProbeState:
         """Refresh some probes, if the sky or a pose is not what they saw."""
         key = _key(frame.scene, frame.time)
         if key != state.key:
+            state = state.copied()
             state.key = key
             state.pending[:] = self.refreshes_to_settle
         if self.update and state.pending.any():
+            state = state.copied(with_maps=True)
             probes = state.take_stale(self.update)
             state.refresh(frame.scene, lit_data(frame.scene, frame.device), probes)
         return state

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from typing import Any
@@ -164,6 +165,16 @@ class ProbeState:
         self._bounce(work, len(probes), is_last=True)
         self._keep_emission(work)
         self.refreshes += 1
+
+    def copied(self, with_maps: bool = False) -> ProbeState:
+        """Return a state that ``take_stale`` may change, and with maps of its own ``refresh``; this one stays."""
+        state = copy.copy(self)
+        state.pending, state.field = self.pending.copy(), launch.copied(self.field, field_kernels.LightField)
+        for name in self.field._cls.vars if with_maps else ():
+            value = getattr(self.field, name)
+            if isinstance(value, wp.array):
+                setattr(state.field, name, wp.clone(value))
+        return state
 
     def take_stale(self, most: int) -> np.ndarray:
         """Return up to ``most`` probes that need a refresh, in turns, and count it as done."""

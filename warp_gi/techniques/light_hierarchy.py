@@ -33,6 +33,10 @@ class LightHierarchy(Estimator):
         """Return the tree over the lights at time 0."""
         return first_tree(scene, launch.get_device(device))
 
+    def depends_on_past(self, scene: Any, ahead: Any = None) -> bool:
+        """Return False: the tree's shape is that at time 0, and its bounds are those of the frame's lights."""
+        return False
+
     def preprocess(self, frame: Any, state: TreeState | None) -> TreeState | None:
         """Bring the tree up to the frame's lights, and give it to the paths."""
         if state is None:

@@ -15,6 +15,7 @@ from warp_gi.errors import OptionError
 from warp_gi.kernels import types
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_bake as bake_kernels
+from warp_gi.scene.geometry import surface_area
 
 DEFAULT_CELLS = 77
 """Cells along the scene's longest axis where no cell size is given; the paper's Sponza (50 cm)."""
@@ -152,6 +153,7 @@ class FieldBaker:
         device: Where it runs.
         seed: Decides every sample and ray.
         left_out: int32 [object], 1 for objects whose surfaces are not sampled; None samples all.
+        area: Of all triangles [m^2], which the density follows from; None is that of ``geometry`` as it is now.
     """
 
     def __init__(
@@ -164,11 +166,12 @@ class FieldBaker:
         device: wp.Device,
         seed: int = 0,
         left_out: np.ndarray | None = None,
+        area: float | None = None,
     ) -> None:
         self.geometry, self.bvh, self.grid, self.settings, self.device = geometry, bvh, grid, settings, device
         self.rays = -(-settings.rays // 8) * 8
         self.words = words_of(settings.resolution)
-        self.density = self._density()
+        self.density = self._density(area)
         """Samples a square metre of one side."""
         self._seed = seed & 0xFFFFFFFF
         self._query = field_query(device, self.rays, BAKE_SETS, seed, 0 if device.is_cuda else HINTS)
@@ -187,12 +190,12 @@ class FieldBaker:
         """Samples, their rays, and how many of those were traced, of all bakes so far."""
         return {"samples": self.samples, "rays": self.rays_asked, "rays_traced": self.rays_traced}
 
-    def _density(self) -> float:
+    def _density(self, area: float | None) -> float:
         if not self.settings.samples:
             return SAMPLES_A_CELL / self.grid.cell_size**2
-        corners = self.geometry.points.numpy()[self.geometry.indices.numpy()].astype(np.float64)
-        area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        return self.settings.samples / (2.0 * float(area.sum()))
+        if area is None:
+            area = surface_area(self.geometry.points.numpy(), self.geometry.indices.numpy())
+        return self.settings.samples / (2.0 * area)
 
     def find(self, cells: np.ndarray | None = None) -> Pieces:
         """Return the surfaces in ``cells`` (numbers in the grid), or in all of them."""

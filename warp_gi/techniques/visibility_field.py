@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from warp_gi import launch
 from warp_gi.baking import Bake
 from warp_gi.camera import Camera, CameraPath
 from warp_gi.errors import OptionError, unknown_name
-from warp_gi.estimator import Estimator
+from warp_gi.estimator import Ahead, Estimator
 from warp_gi.kernels import harmonics as harmonics_kernels
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_trace as trace_kernels
@@ -124,7 +125,9 @@ class VisibilityField(Estimator):
         """Return the masks of all cells, or, when ``lazy`` and there is a camera, of those that it sees."""
         if self.mode == "traced":
             return None
-        state = FieldState(scene, launch.get_device(device), self, seed)
+        target = launch.get_device(device)
+        scene.update(0.0, None, target)
+        state = FieldState(scene, target, self, seed)
         cells = cells_on_path(state, camera) if self.lazy and camera is not None else None
         state.bake(cells, progress)
         return state.to_bake()
@@ -138,24 +141,53 @@ class VisibilityField(Estimator):
 
     # ---- frames ----
 
+    @property
+    def saves_state(self) -> bool:
+        """Whether a saved state holds all that frames before left: not transfers, of 108 bytes a pixel."""
+        return not self.relight
+
+    @property
+    def _grows(self) -> bool:
+        return self.mode != "traced" and self.lazy and self.budget > 0
+
+    def depends_on_past(self, scene: Any, ahead: Ahead | None = None) -> bool:
+        """Return whether a frame may find cells that those before it baked, or what pixels transferred then.
+
+        No cells are baked on the way if nothing moves and all cells that the frames ahead see are known.
+        """
+        if self.relight or not self._grows:
+            return self.relight
+        return ahead is None or bool(scene.moving_objects) or ahead.state.lacks(ahead.views)
+
     def preprocess(self, frame: Any, state: FieldState) -> FieldState:
         """Bake what came into view, within the budget; draw the frame's samples; look at the sky and at what moves."""
+        state = copy.copy(state)
         state.query = self._query(frame)
         state.sky = self._sky(frame)
+        self._bake_in_view(frame, state)
+        if self.relight and not _is_black(frame.scene):
+            key = self._relight_key(frame, state)
+            state.relights = state.transfer_key == key
+            if not state.relights:
+                width, height = frame.camera.resolution
+                state.transfer = wp.zeros(27 * width * height, dtype=wp.float32, device=frame.device)
+                state.transfer_key = key
+        return state
+
+    def _bake_in_view(self, frame: Any, state: FieldState) -> None:
         if self.mode == "traced":
             none = wp.empty(0, dtype=wp.int32, device=frame.device), wp.empty(0, dtype=wp.uint32, device=frame.device)
             state.upload()
             state.data.slots, state.data.masks = none
-            return state
+            return
         state.move(frame.time)
         most_rays = self.budget * RAYS_A_MILLISECOND
-        if self.lazy and self.budget > 0:
+        if self._grows:
             cells = state.cells_in_view(frame.camera, corners_of(frame.index))
             state.bake(cells, None, most_rays)
             if state.movers and state.rests:
                 state.bake_rest(cells, most_rays)
         state.upload()
-        return state
 
     def _query(self, frame: Any) -> Any:
         size = min(-(-frame.pipeline.spp // 8) * 8, MOST_SET_SIZE)
@@ -187,22 +219,13 @@ class VisibilityField(Estimator):
 
     def trace(self, frame: Any, state: FieldState) -> None:
         """Add the light of the current camera sample, or of all of them when the pixels' transfers are known."""
-        if frame.scene.environment is None or frame.scene.environment.is_black:
+        if _is_black(frame.scene):
             return
-        view, transfer = frame.pass_settings.camera_sample, wp.empty(0, dtype=wp.float32, device=frame.device)
-        if self.relight:
-            key = self._relight_key(frame, state)
-            views = frame.pass_settings.camera_samples
-            if state.transfer_key == key and state.transfer_views == views:
-                if view == 0:
-                    frame.launch(trace_kernels.relight, [state.sky.harmonics, state.transfer, frame["environment"]])
-                return
-            if view == 0:
-                width, height = frame.camera.resolution
-                state.transfer = wp.zeros(27 * width * height, dtype=wp.float32, device=frame.device)
-                state.transfer_key, state.transfer_views = key, 0
-            state.transfer_views += 1
-            transfer = state.transfer
+        if self.relight and state.relights:
+            if frame.pass_settings.camera_sample == 0:
+                frame.launch(trace_kernels.relight, [state.sky.harmonics, state.transfer, frame["environment"]])
+            return
+        transfer = state.transfer if self.relight else wp.empty(0, dtype=wp.float32, device=frame.device)
         buffers = trace_kernels.FieldBuffers()
         buffers.environment, buffers.transfer = frame["environment"], transfer
         buffers.moment1, buffers.moment2 = frame.moments("environment")
@@ -215,6 +238,10 @@ class VisibilityField(Estimator):
         poses = b"".join(pose.tobytes() for pose in state.poses or ())
         camera = frame.camera
         return camera.world_from_camera.tobytes(), camera.hfov, camera.resolution, poses, len(state.cells)
+
+
+def _is_black(scene: Any) -> bool:
+    return scene.environment is None or scene.environment.is_black
 
 
 def _set_count(size: int) -> int:

@@ -4,12 +4,16 @@ Two layers. The lasting one is baked without the objects that can move. It stays
 occluded is, and what it calls visible is unless the ray meets one of their boxes, and then the ray is traced. Their own
 surfaces are not in it, so their pixels trace. Once everything has come to rest, cells in view are baked again with all
 that is there; this second layer is dropped at the next motion.
+
+A frame works on a shallow copy: every method puts new arrays in the place of those that it changes.
 """
 
 from __future__ import annotations
 
+import copy
+import hashlib
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -53,16 +57,19 @@ class FieldState:
         self.poses: list[np.ndarray] | None = None
         self.rests = False
         """Whether nothing moved between the last two frames."""
-        self.rest: dict[int, tuple[np.ndarray, int]] = {}
-        """Cells of the layer that is baked with everything at rest: masks and flags."""
+        self.rest: dict[int, tuple[np.ndarray, int] | None] = {}
+        """Cells of the layer that is baked with everything at rest: masks and flags, None without any surface."""
         self.empty = np.zeros(self.grid.cell_count, bool)
         """[cell] True where no surface was found, and nothing is left to bake."""
         self.data: Any = None
         self.query: Any = None
         self.sky: Any = None
         self.transfer: Any = None
+        """float32 [27 * pixel] what each harmonic adds, of the frame that ``transfer_key`` is of; None if not kept."""
         self.transfer_key: tuple[Any, ...] | None = None
-        self.transfer_views = 0
+        self.relights = False
+        """Whether the frame has its light from ``transfer``, which is known then; else it fills that."""
+        self._start_count, self._start_empty = 0, self.empty
         self._bakers: dict[str, FieldBaker] = {}
         self._dirty = True
 
@@ -91,6 +98,7 @@ class FieldState:
             )
         state._add(cells, masks.astype(np.uint32), flags)
         state.empty[empty] = True
+        state._start_count, state._start_empty = len(cells), state.empty
         state.counts |= {name: int(bake.counts.get(name, 0)) for name in state.counts}
         state.seconds = float(bake.counts.get("seconds", 0.0))
         return state
@@ -106,6 +114,50 @@ class FieldState:
         key = self.settings.bake_key(self.scene)
         return Bake(type(self.settings).__name__, key, settings, arrays, counts, self.scene.name)
 
+    # ---- to and from what frames leave behind ----
+
+    def saved_arrays(self) -> dict[str, np.ndarray]:
+        """Return what frames added to the state before the first one: cells of both layers, and poses."""
+        added, first = slice(self._start_count, None), np.zeros((0, self.words), np.uint32)
+        rest = {cell: entry for cell, entry in self.rest.items() if entry is not None}
+        return {
+            "start": np.frombuffer(self._start_digest().digest(), np.uint8),
+            "cells": self.cells[added],
+            "flags": self.flags[added],
+            "masks": self.masks[added],
+            "empty_cells": np.flatnonzero(self.empty & ~self._start_empty).astype(np.int32),
+            "rest_cells": np.array(list(rest), np.int32),
+            "rest_flags": np.array([flags for _, flags in rest.values()], np.int32),
+            "rest_masks": np.stack([masks for masks, _ in rest.values()]) if rest else first,
+            "rest_empty_cells": np.array([cell for cell, entry in self.rest.items() if entry is None], np.int32),
+            "poses": np.array(self.poses or np.zeros((0, 4, 4)), np.float64),
+        }
+
+    def with_saved_arrays(self, arrays: Mapping[str, np.ndarray]) -> FieldState:
+        """Return the state before the first frame with what ``saved_arrays`` holds.
+
+        Raises KeyError where one is missing, ValueError if they are of a field that began with other cells.
+        """
+        if arrays["start"].tobytes() != self._start_digest().digest():
+            raise ValueError("the field began with other cells")
+        state, count = copy.copy(self), self._start_count
+        state.slots = self.slots.copy()
+        state.slots[self.cells[count:]] = field_kernels.NO_SLOT
+        state.cells, state.masks = self.cells[:count], self.masks[:count]
+        state._add(arrays["cells"], arrays["masks"], arrays["flags"])
+        state.empty = self._start_empty.copy()
+        state.empty[arrays["empty_cells"]] = True
+        state.rest = dict.fromkeys(arrays["rest_empty_cells"].tolist())
+        rest = zip(arrays["rest_masks"], arrays["rest_flags"].tolist(), strict=True)
+        state.rest |= dict(zip(arrays["rest_cells"].tolist(), rest, strict=True))
+        state.poses = list(arrays["poses"]) or None
+        state.transfer, state.transfer_key = None, None
+        return state
+
+    def _start_digest(self) -> Any:
+        start = np.concatenate([self.cells[: self._start_count], np.flatnonzero(self._start_empty)])
+        return hashlib.sha256(start.astype(np.int64).tobytes())
+
     # ---- baking ----
 
     def baker(self, layer: str) -> FieldBaker:
@@ -118,9 +170,8 @@ class FieldState:
                 left_out[list(self.movers)] = 1
             else:
                 bvh, left_out = data.bvh, None
-            self._bakers[layer] = FieldBaker(
-                data.geometry, bvh, self.scene.radius, self.grid, self.settings, self.device, self.seed, left_out
-            )
+            place = (self.scene.radius, self.grid, self.settings, self.device, self.seed)
+            self._bakers[layer] = FieldBaker(data.geometry, bvh, *place, left_out, self.scene.surface_area)
         return self._bakers[layer]
 
     def bake(self, cells: np.ndarray | None = None, progress: Any = None, most_rays: float = np.inf) -> None:
@@ -139,7 +190,7 @@ class FieldState:
         if cells is not None:
             nothing[cells] = True
         nothing[pieces.cells] = False
-        self.empty |= nothing
+        self.empty = self.empty | nothing
         self._add(pieces.cells, masks, flags)
         self.seconds += time.perf_counter() - started
 
@@ -151,6 +202,7 @@ class FieldState:
 
     def _add(self, cells: np.ndarray, masks: np.ndarray, flags: np.ndarray) -> None:
         boxed = field_kernels.SLOT_BOXED if self.movers else 0
+        self.slots = self.slots.copy()
         self.slots[cells] = np.arange(len(self.cells), len(self.cells) + len(cells), dtype=np.int32) | flags | boxed
         self.cells = np.concatenate([self.cells, cells.astype(np.int32)])
         self.masks = np.concatenate([self.masks, masks])
@@ -165,8 +217,8 @@ class FieldState:
         cells = self._affordable(baker, cells, most_rays)
         pieces = baker.find(cells)
         masks, flags = baker.bake(pieces)
-        self.rest |= dict.fromkeys(cells.tolist(), None)
-        self.rest |= {int(cell): (masks[i], int(flags[i])) for i, cell in enumerate(pieces.cells)}
+        found = {int(cell): (masks[i], int(flags[i])) for i, cell in enumerate(pieces.cells)}
+        self.rest = self.rest | dict.fromkeys(cells.tolist(), None) | found
         self._dirty = True
 
     # ---- a frame ----
@@ -176,7 +228,7 @@ class FieldState:
         poses = [self.scene.world_from_node(node, now) for node in self.movers.values()]
         moved = self.poses is None or any(not np.array_equal(a, b) for a, b in zip(poses, self.poses, strict=True))
         if moved and self.movers:
-            self.rest.clear()
+            self.rest = {}
             self._dirty = True
         self.rests = not moved
         self.poses = poses
@@ -205,6 +257,14 @@ class FieldState:
         masks_array = wp.array(masks.reshape(-1), dtype=wp.uint32, device=self.device)
         self.data = grid_struct(self.grid, self.settings.resolution, slots_array, masks_array)
         self._dirty = False
+
+    def lacks(self, views: Iterable[tuple[int, Camera]]) -> bool:
+        """Return whether one of these frames, by number and camera, sees cells that are still to be baked."""
+        for view, corners in distinct_views(views):
+            cells = self.cells_in_view(view, sorted(corners))
+            if ((self.slots[cells] < 0) & ~self.empty[cells]).any():
+                return True
+        return False
 
     def cells_in_view(self, camera: Camera, corners: Sequence[int] = range(4)) -> np.ndarray:
         """Return the cells that a camera sees, int32, those seen most first.
@@ -236,11 +296,16 @@ def cells_on_path(state: FieldState, camera: Camera | CameraPath) -> np.ndarray:
     """Return all cells that a camera, or a path in any of its frames, sees; with animation, of a scene at time 0."""
     if isinstance(camera, Camera):
         return np.sort(state.cells_in_view(camera))
+    views = distinct_views((index, camera.camera(index)) for index in range(camera.frame_count))
+    whole = len(views) <= 4
+    found = [state.cells_in_view(view, range(4) if whole else sorted(corners)) for view, corners in views]
+    return np.unique(np.concatenate(found))
+
+
+def distinct_views(frames: Iterable[tuple[int, Camera]]) -> list[tuple[Camera, set[int]]]:
+    """Return the cameras of frames, equal ones once, with the corners that those frames look through."""
     views: dict[bytes, tuple[Camera, set[int]]] = {}
-    for index in range(camera.frame_count):
-        view = camera.camera(index)
+    for index, view in frames:
         key = view.world_from_camera.tobytes() + repr((view.hfov, view.resolution)).encode()
         views.setdefault(key, (view, set()))[1].update(corners_of(index))
-    whole = len(views) <= 4
-    found = [state.cells_in_view(view, range(4) if whole else sorted(corners)) for view, corners in views.values()]
-    return np.unique(np.concatenate(found))
+    return list(views.values())
