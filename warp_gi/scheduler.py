@@ -318,6 +318,7 @@ class FrameScheduler:
 
     def frame(self, index: int, previous_index: int | None = None) -> Frame:
         """Render frame ``index``; motion is towards frame ``previous_index`` (None: the frame before it, if any)."""
+        self.scene.check_unchanged()
         self.bake()
         if previous_index is None:
             previous_index = max(index - 1, 0)
@@ -527,6 +528,7 @@ def bake(
 
     Raises OptionError for a device that is not there, or an estimator that has nothing to bake.
     """
+    scene.check_unchanged()
     told = (lambda share: progress("bake", share)) if progress else None
     result = estimator.bake(scene, device, seed, told, camera_path)
     if result is None:
