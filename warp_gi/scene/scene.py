@@ -37,6 +37,10 @@ class Scene:
         camera_nodes: Which node carries a camera, by the camera's name, for cameras that move with a node.
 
     Raises SceneError if anything in it cannot be rendered: one line that names the mesh, material or light.
+
+    What pictures are made from is copied: geometry when the scene is made, and by ``animate``; materials, textures and
+    lights when it is first used on a device. An edit after that is a SceneError at the next frame, see
+    ``check_unchanged``. What works at any time is ``animate`` and an assignment of ``environment``.
     """
 
     def __init__(
