@@ -50,6 +50,7 @@ class Edits:
         self.scene = scene
         self.nodes = list(scene.nodes)
         self.slots = _slots(scene)
+        self.materials = list(scene.materials)
         self.material_count = len(scene.materials)
         self.emissions = _emissions(scene.materials)
         self.watch = Watch(_geometry(scene), bare=True)
@@ -62,9 +63,14 @@ class Edits:
         """Watch everything from now on: a device holds all that the scene is made of."""
         scene = self.scene
         self.light_world = [matrix.copy() for matrix in animation.world_matrices(scene.nodes, 0.0)]
-        self.light_list = list(scene.lights)
-        self.watch = Watch([*_geometry(scene), *_shading(scene)])
+        self._watch_all()
         self.sky_in_use()
+
+    def _watch_all(self) -> None:
+        scene = self.scene
+        self.nodes, self.light_list = list(scene.nodes), list(scene.lights)
+        self.materials = scene.materials[: self.material_count]
+        self.watch = Watch([*_geometry(scene), *_shading(scene)])
 
     def sky_in_use(self) -> None:
         """Watch the environment that devices hold now."""
@@ -85,8 +91,7 @@ class Edits:
                     f"and pictures would not show it; {edit.cure}"
                 )
         if changes and self.scene._devices:  # of no account, such as an equal copy of an array
-            self.nodes, self.light_list = list(self.scene.nodes), list(self.scene.lights)
-            self.watch = Watch([*_geometry(self.scene), *_shading(self.scene)])
+            self._watch_all()
 
     def _edit(self, change: Change) -> Edit | None:
         owner, field = change
@@ -200,10 +205,17 @@ class Edits:
 
     def _materials_edit(self) -> Edit | None:
         """Return whether the list of materials lacks one, or has another instead."""
-        now = self.scene.materials
+        scene, now = self.scene, self.scene.materials
+        cure = f"give meshes their material (mesh.material = ...), and {NEW_SCENE}"
         if len(now) < self.material_count:
-            return Edit(f"a material was removed from scene.materials (it had {self.material_count}, has {len(now)})")
-        return _first(self._material_edit(material, "a field") for material in now[: self.material_count])
+            return Edit(f"material {_come_or_gone(now, self.materials)} in scene.materials", cure)
+        if not scene._devices:
+            return None  # read later
+        data = next(iter(scene._devices.values())).data
+        for row, (material, old) in enumerate(zip(now, self.materials, strict=False)):
+            if material is not old and _row_edit(material, data, row, "a field"):
+                return Edit(f"material {row} {old.name!r} was replaced in scene.materials", cure)
+        return None
 
     def _material_edit(self, material: Material, hint: str) -> Edit | None:
         """Return whether a material is no longer like its copies on devices; ``hint`` names the field if need be."""
