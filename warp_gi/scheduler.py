@@ -321,6 +321,7 @@ class FrameScheduler:
 
         A frame that an exception interrupts leaves nothing behind: what is rendered next is as if it had not begun.
         """
+        self.scene.check_unchanged()
         self.bake()
         if previous_index is None:
             previous_index = max(index - 1, 0)
@@ -521,7 +522,7 @@ def render(
         bakes: Bakes made before (``gi.bake``, ``gi.load_bake``), each for the estimator that it names.
 
     Raises OptionError for a device that is not there, a negative frame or seed, BakeError for a bake of another
-    scene or other settings.
+    scene or other settings, SceneError for a scene that was edited so that pictures would not show it.
     """
     if frames is None:
         frames = range(camera.frame_count if isinstance(camera, CameraPath) else 1)
@@ -552,8 +553,10 @@ def bake(
         camera_path: From where the scene will be seen, for estimators that bake no more than that; None is everywhere.
         progress: Called with (stage, share done in [0, 1]).
 
-    Raises OptionError for a device that is not there, or an estimator that has nothing to bake.
+    Raises OptionError for a device that is not there, or an estimator that has nothing to bake, SceneError for a
+    scene that was edited after it was built.
     """
+    scene.check_unchanged()
     told = (lambda share: progress("bake", share)) if progress else None
     result = estimator.bake(scene, device, seed, told, camera_path)
     if result is None:

@@ -44,6 +44,9 @@ class BakedScene:
         """Return False: nothing moves."""
         return False
 
+    def check_unchanged(self) -> None:
+        """Do nothing: there is nothing to edit."""
+
     def data(self, device: Any = None) -> types.SceneData:
         """Return buffers that hold nothing."""
         return types.SceneData()

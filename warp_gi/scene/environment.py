@@ -30,6 +30,7 @@ from warp_gi.launch import get_device, on_device
 from warp_gi.scene import harmonics
 from warp_gi.scene.model import Color
 from warp_gi.scene.sky import SunSky, node_solid_angles
+from warp_gi.scene.watching import Watch
 
 __all__ = ["Environment", "SunSky", "as_environment"]
 
@@ -44,6 +45,7 @@ class _Map:
     def __init__(self, pixels: np.ndarray) -> None:
         self.pixels = pixels
         self.arrays: dict[str, tuple[wp.array, ...]] = {}
+        self.watch: Watch | None = None
 
     @cached_property
     def digest(self) -> bytes:
@@ -66,7 +68,12 @@ class _Map:
             weights = _patch_weights(self.pixels)
             texels = on_device(self.pixels.reshape(-1, 3), wp.vec3, device)
             self.arrays[device.alias] = (texels, AliasTable.build(weights).on(device), 1.0 / weights.sum())
+            self.watch = self.watch or Watch([(self, ("pixels", "arrays"))])
         return self.arrays[device.alias]
+
+    def is_edited(self) -> bool:
+        """Whether the pixels differ from what is on devices."""
+        return self.watch is not None and bool(self.watch.changes())
 
 
 def _patch_weights(pixels: np.ndarray) -> np.ndarray:
@@ -172,6 +179,13 @@ class Environment:
         rotation = self.rotation + degrees
         return Environment(self.pixels, self.color, rotation, self.scale, self.name, self._map)
 
+    def renewed(self) -> Environment:
+        """Return this sky itself; what was derived from its pixels is forgotten if they were edited since."""
+        if self._map is not None and (self.pixels is not self._map.pixels or self._map.is_edited()):
+            self.pixels = _checked_pixels(self.pixels, self.name)
+            self._map = _Map(self.pixels)
+        return self
+
     @property
     def world_from_environment(self) -> np.ndarray:
         """float64 [3, 3] rotation of the sky's own directions into world space."""
@@ -206,7 +220,7 @@ def as_environment(value: object) -> Environment:
     if value is None:
         return Environment()
     if isinstance(value, Environment):
-        return value
+        return value.renewed()
     if isinstance(value, SunSky):
         return Environment(pixels=value.pixels(), name="sun and sky")
     if isinstance(value, str | Path):

@@ -143,6 +143,10 @@ def flatten(nodes: Sequence[Node], materials: Sequence[Material], world: Sequenc
                 )
             flat.indices[triangles] = np.asarray(mesh.indices)[:, ::-1] if mirrored else mesh.indices
             flat.indices[triangles] += vertex
+            if id(mesh.material) not in index_of:
+                raise SceneError(
+                    f"mesh {mesh.name!r} of node {node.name!r} has a material that the scene lacks; make a new scene"
+                )
             flat.materials[triangles] = index_of[id(mesh.material)]
             flat.objects[triangles] = object_index
             vertex, triangle = vertices.stop, triangles.stop

@@ -14,6 +14,7 @@ from warp_gi.errors import SceneError, unknown_name
 from warp_gi.kernels import types
 from warp_gi.launch import get_device, on_device
 from warp_gi.scene import animation, emitters, geometry, textures
+from warp_gi.scene.edits import Edits
 from warp_gi.scene.model import Keyframe, Material, Node, PunctualLight
 
 if TYPE_CHECKING:
@@ -36,6 +37,10 @@ class Scene:
         camera_nodes: Which node carries a camera, by the camera's name, for cameras that move with a node.
 
     Raises SceneError if anything in it cannot be rendered: one line that names the mesh, material or light.
+
+    What pictures are made from is copied: geometry when the scene is made, and by ``animate``; materials, textures and
+    lights when it is first used on a device. An edit after that is a SceneError at the next frame, see
+    ``check_unchanged``. What works at any time is ``animate`` and an assignment of ``environment``.
     """
 
     def __init__(
@@ -66,8 +71,8 @@ class Scene:
         """Build what follows from the nodes; call again when keyframes change."""
         self.version += 1
         self._moving = animation.moving_nodes(self.nodes)
-        world = animation.world_matrices(self.nodes, 0.0)
-        self._flat = geometry.flatten(self.nodes, self.materials, world)
+        self._world = [matrix.copy() for matrix in animation.world_matrices(self.nodes, 0.0)]
+        self._flat = geometry.flatten(self.nodes, self.materials, self._world)
         if not np.isfinite(self._flat.points).all():
             raise SceneError(f"scene {self.name!r}: node transforms move vertices past the range of float32")
         self._emissive, self._triangle_powers = emitters.emissive_triangles(self._flat, self.materials)
@@ -75,6 +80,7 @@ class Scene:
         self._devices: dict[str, _DeviceScene] = {}
         self._geometry_hash: str | None = None
         self._contents_hash: str | None = None
+        self._edits = Edits(self)
 
     # ---- what is in it ----
 
@@ -93,6 +99,8 @@ class Scene:
         self.version += 1
         for device_scene in self._devices.values():
             device_scene.set_environment(value)
+        if self._devices:
+            self._edits.sky_in_use()
 
     @property
     def triangle_count(self) -> int:
@@ -216,6 +224,7 @@ class Scene:
         if len(matches) > 1:
             raise SceneError(f"{len(matches)} nodes are named {node!r}; give the one to animate a name of its own")
         animation.check_keyframes(keyframes, node)
+        geometry.check_nodes(self.nodes)  # they are read anew, with every edit so far
         self.nodes[matches[0]].keyframes = list(keyframes)
         self._flatten()
 
@@ -262,8 +271,18 @@ class Scene:
         """
         device = _device(device)
         if device.alias not in self._devices:
+            self._edits.check()
             self._devices[device.alias] = _DeviceScene(self, device)
+            if len(self._devices) == 1:
+                self._edits.in_use()
         return self._devices[device.alias].data
+
+    def check_unchanged(self) -> None:
+        """Raise SceneError if something was edited that pictures would not show: one line that says what, and the cure.
+
+        Called for every frame. It reads all arrays of meshes and textures, and the pixels of the sky.
+        """
+        self._edits.check()
 
     def bvh(self, device: str | wp.Device | None = None) -> Any:
         """Return the TriangleBvh behind ``data(device)``."""
@@ -296,13 +315,14 @@ class _DeviceScene:
         from warp_gi.scene.masks import alpha_masks
 
         self.scene, self.device = scene, device
-        self.world = self.previous_world = animation.world_matrices(scene.nodes, 0.0)
+        self.world = self.previous_world = scene._world
         flat = scene._flat
         if scene.is_animated:
             flat = replace(flat, points=flat.points.copy(), normals=flat.normals.copy())
         self.flat = flat
         self.previous_points = flat.points.copy() if scene.is_animated else flat.points
-        self.emitters = emitters.emitter_table(scene._emissive, scene.lights, self.world)
+        world = animation.world_matrices(scene.nodes, 0.0)  # lights need not be where they were when it was made
+        self.emitters = emitters.emitter_table(scene._emissive, scene.lights, world)
         emitter_of = np.full(scene.triangle_count, -1, np.int32)
         emitter_of[scene._emissive] = np.arange(len(scene._emissive), dtype=np.int32)
         images = textures.distinct_textures(scene.materials)
