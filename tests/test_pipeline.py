@@ -1,13 +1,17 @@
 """Pipeline, scheduler and frame: settings, buffers, motion, determinism."""
 
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warp_gi as gi
 from warp_gi.bench.presets import sphere
 from warp_gi.errors import OptionError
+from warp_gi.estimator import Estimator
+from warp_gi.kernels.sampling import random_1d
 from warp_gi.launch import set_threads
 
 SIZE = (24, 16)
@@ -195,7 +199,7 @@ def test_metadata_and_timings_tell_how_it_was_made():
     frame = one_frame(seed=9)
     assert frame.metadata["seed"] == 9
     assert frame.metadata["pipeline.indirect"] == "BsdfPaths"
-    assert frame.metadata["pipeline.indirect.max_depth"] == 8
+    assert frame.metadata["pipeline.indirect.max_depth"] == 64
     assert len(frame.metadata["scene_hash"]) == 64
     assert {"bake", "compile", "scene", "primary", "paths", "compose"} <= set(frame.timings)
     assert all(seconds >= 0 for seconds in frame.timings.values())
@@ -214,6 +218,64 @@ def test_variance_predicts_the_spread_over_seeds():
     measured = np.var([f.numpy("beauty") for f in images], axis=0, ddof=1).mean()
     predicted = np.mean([f.numpy("variance") for f in images])
     assert 0.3 * predicted < measured < 1.3 * predicted
+
+
+# Thread: a pixel. Adds samples that are 0 or 1, half of them each.
+@wp.kernel(enable_backward=False)
+def toss_coins(
+    first: wp.int32,
+    samples: wp.int32,
+    seed: wp.uint32,
+    term: wp.array(dtype=wp.vec3),
+    moment1: wp.array(dtype=wp.vec3),
+    moment2: wp.array(dtype=wp.vec3),
+):
+    pixel = first + wp.tid()
+    for sample in range(samples):
+        if random_1d(wp.uint32(pixel), seed, sample) < 0.5:
+            one = wp.vec3(1.0, 1.0, 1.0)
+            term[pixel] = term[pixel] + one
+            moment1[pixel] = moment1[pixel] + one
+            moment2[pixel] = moment2[pixel] + one
+
+
+class Coins(Estimator):
+    """A launch of its own, as a technique makes that is not path traced with the rest."""
+
+    def trace(self, frame, state):
+        """Add the samples of one camera sample."""
+        settings = frame.pass_settings
+        seed = wp.uint32((frame.seed + settings.camera_sample) & 0xFFFFFFFF)
+        frame.launch(toss_coins, [settings.sample_count, seed, frame[self.term], *frame.moments(self.term)])
+
+
+def coins_of(name):
+    class CoinsOfTerm(Coins):
+        term: ClassVar[str] = name
+
+    return CoinsOfTerm()
+
+
+@pytest.mark.parametrize("term", ["environment", "emitters", "indirect"])
+def test_moments_of_every_term_reach_the_variance(term):
+    """Coins scatter as the binomial distribution says; path tracing of the other terms adds its own variance."""
+    alone = gi.Pipeline(**{**dict.fromkeys(("environment", "emitters", "indirect")), term: coins_of(term)}, spp=8)
+    scene = gi.Scene([gi.Node("wall", [quad(-2.0, 5.0)])], environment=(0.3, 0.4, 0.5))
+    frames = list(gi.render(scene, gi.CameraPath.still(camera()), alone, frames=range(48)))
+    scatter = np.var([frame.numpy("beauty") for frame in frames], axis=0, ddof=1).mean()
+    claimed = np.mean([frame.numpy("variance") for frame in frames])
+    assert scatter == pytest.approx(0.25 / 8, rel=0.05) and claimed == pytest.approx(scatter, rel=0.05)
+    others = {} if term == "environment" else {"environment": gi.TracedEnvironment()}
+    both, paths = (
+        one_frame(scene, pipeline=replace(alone, **others, **more)).numpy("variance").mean()
+        for more in ({}, {term: None})
+    )
+    assert both == pytest.approx(paths + 0.25 / 8, rel=0.1)
+
+
+def test_moments_of_an_unknown_term_are_an_error():
+    with pytest.raises(OptionError, match="unknown term 'emitter'; did you mean 'emitters'"):
+        one_frame().moments("emitter")
 
 
 def test_a_lamp_that_moved_lights_like_one_that_stands_there():
