@@ -13,6 +13,7 @@ import numpy as np
 import warp_gi as gi
 from warp_gi import launch, metrics
 from warp_gi.bench.measure import Row
+from warp_gi.bench.presets import REFERENCE_DEPTH
 from warp_gi.cli_compare import read_image
 from warp_gi.errors import OptionError, SceneError
 
@@ -128,7 +129,8 @@ def computed(
     """
     chunk = min(max(spp // 2, 1), CHUNK)
     count = max(round(spp / 2 / chunk), 1)
-    pipeline = gi.Pipeline.preset("path", spp=chunk, camera_samples=1 if centred else chunk)
+    indirect = gi.BsdfPaths(max_depth=REFERENCE_DEPTH)
+    pipeline = gi.Pipeline.preset("path", spp=chunk, camera_samples=1 if centred else chunk, indirect=indirect)
     compiled, started, halves = launch.compile_seconds, time.perf_counter(), []
     for half in range(2):
         frames = StillFrames(scene, camera, pipeline, device, seed + (half + 1) * _FAR, moment)

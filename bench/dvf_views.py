@@ -6,14 +6,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench.measure import Row, Times
 from warp_gi.bench.stages import DARK, LAMBERT, Case, Stage, rmse, timed_bake
-from warp_gi.kernels import visibility_field as field_kernels
-from warp_gi.kernels import visibility_field_audit as audit_kernels
+from warp_gi.techniques import visibility_audit
 from warp_gi.techniques.visibility_state import FieldState
 
 CASES = (
@@ -96,32 +94,6 @@ class View:
         return self._cells[size] * 4 * stage.state.words + stage.state.slots.nbytes
 
 
-def audit(stage: FieldStage) -> dict[str, np.ndarray]:
-    """Return for each pixel how many of its cosine-weighted rays are in which state, and how many sure ones wrong."""
-    frame, state, names = stage.frame, stage.state, audit_kernels.AuditBuffers.vars
-    buffers, count = audit_kernels.AuditBuffers(), int(np.prod(frame.camera.resolution))
-    for name in names:
-        setattr(buffers, name, wp.zeros(count, dtype=wp.int32, device=frame.device))
-    inputs = [frame.data, frame.camera_data, frame.pass_settings, state.data, state.query, frame.hits, buffers]
-    frame.launch_tiled(audit_kernels.audit_field, inputs)
-    return {name: getattr(buffers, name).numpy() for name in names}
-
-
-def traced_share(stage: FieldStage, counts: dict[str, np.ndarray]) -> float:
-    """Return the share of rays that the stage's mode traces."""
-    visible, occluded = counts["visible"], counts["occluded"]
-    open_, total = counts["mixed"] + counts["unknown"], visible + occluded + counts["mixed"] + counts["unknown"]
-    if stage.estimator.mode == "traced":
-        return 1.0
-    if stage.estimator.mode == "paper":  # inside one of the masks; what neither has is not traced
-        label = counts["label"]
-        inside = np.where(label & field_kernels.SLOT_LABEL, visible, occluded) + counts["mixed"]
-        open_ = np.where(label < 0, total, inside)
-    elif stage.estimator.mode == "unbiased":
-        open_ = open_ + stage.estimator.verify * (visible + occluded)
-    return float(open_.sum() / max(total.sum(), 1))
-
-
 def white_error(stage: FieldStage, traced: FieldStage) -> np.ndarray:
     """Return how the pictures of Lambert surfaces under a white sky would differ if all were white, [pixel]."""
     channel = np.argmax(stage.albedo, axis=-1)[..., None]
@@ -135,8 +107,9 @@ def quality(stage: FieldStage, traced: FieldStage) -> Row:
     Wrong rays are those that the field is sure of and wrong about; "unbiased" makes up for them. What the mode
     "paper" gets wrong shows in the picture, as no cell of its errs in both ways; in the others the audit counts it.
     """
-    counts = audit(stage)
-    total = max(sum(int(counts[name].sum()) for name in ("visible", "occluded", "mixed", "unknown")), 1)
+    counts = visibility_audit.audit(stage.frame, stage.state)
+    total = max(int(visibility_audit.rays_asked(counts).sum()), 1)
+    traced_share = float(visibility_audit.rays_traced(counts, stage.estimator).sum() / total)
     error, wrong = white_error(stage, traced), counts["lost"] + counts["leaked"]
     if stage.estimator.mode == "three_state":
         error = (counts["leaked"] - counts["lost"]) / stage.spp
@@ -147,6 +120,6 @@ def quality(stage: FieldStage, traced: FieldStage) -> Row:
         "relMSE": gi.metrics.rel_mse(stage.picture, traced.picture),
         "FLIP": gi.metrics.flip(stage.picture, traced.picture),
         "RMSE white": rmse(error),
-        "traced share": traced_share(stage, counts),
+        "traced share": traced_share,
         "wrong per million": float(wrong.sum() / total * 1e6),
     }

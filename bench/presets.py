@@ -14,6 +14,10 @@ from warp_gi.scene.builtin import shapes
 SCENES = Path(os.environ.get("WARP_GI_SCENES", Path(__file__).resolve().parents[1] / ".." / "shared" / "scenes"))
 """Folder of the scene files, which are not part of the project."""
 
+REFERENCE_DEPTH = 64
+"""``max_depth`` of the path-traced pictures that others are measured against. Longer paths bring less than a thousandth
+of a percent of the indirect light in any scene of `places`."""
+
 LIVING_ROOM, DRAGON = "living_room/living_room.obj", "stanford_dragon.ply"
 
 

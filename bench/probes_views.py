@@ -9,11 +9,10 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi.bench.measure import Row, Times
+from warp_gi.bench.presets import REFERENCE_DEPTH
 from warp_gi.bench.stages import LAMBERT, PLAIN, Case, Stage, timed_bake
 from warp_gi.metrics import RELATIVE_EPSILON
 
-MAX_DEPTH = 16
-"""Of the path tracer that is the truth; probes let light bounce until it changes no more."""
 SEED = 7
 
 
@@ -50,7 +49,7 @@ class View:
 
     def paths(self, spp: int, seed: int = SEED) -> Stage:
         """Return the stage of the path tracer at ``spp`` samples a pixel."""
-        return Stage(self.scene, self.camera, gi.BsdfPaths(max_depth=MAX_DEPTH), spp, self.device, seed=seed)
+        return Stage(self.scene, self.camera, gi.BsdfPaths(max_depth=REFERENCE_DEPTH), spp, self.device, seed=seed)
 
     @property
     def halves(self) -> list[np.ndarray]:

@@ -9,6 +9,7 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi.bench.measure import Row, Times, cost, timed
+from warp_gi.bench.presets import REFERENCE_DEPTH
 from warp_gi.bench.stages import Case
 
 MEASURED = ("emitters", "indirect", "beauty")
@@ -56,7 +57,8 @@ class Truth:
     def halves(self) -> list[dict[str, np.ndarray]]:
         """Pictures by term."""
         if not self._halves:
-            pipeline = gi.Pipeline(indirect=gi.BsdfPaths(**self.settings), spp=self.spp, camera_samples=1)
+            paths = gi.BsdfPaths(**{"max_depth": REFERENCE_DEPTH, **self.settings})
+            pipeline = gi.Pipeline(indirect=paths, spp=self.spp, camera_samples=1)
             for half in range(2):
                 scheduler = gi.FrameScheduler(self.scene, self.camera, pipeline, self.device, seed=SEED + 1000 + half)
                 frame = scheduler.frame(self.frame)

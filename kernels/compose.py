@@ -18,6 +18,8 @@ class FrameSums:
     moment2: wp.array(dtype=wp.vec3)
     environment_moment1: wp.array(dtype=wp.vec3)  # of a term that was not path traced with the rest, or empty
     environment_moment2: wp.array(dtype=wp.vec3)
+    emitters_moment1: wp.array(dtype=wp.vec3)
+    emitters_moment2: wp.array(dtype=wp.vec3)
     indirect_moment1: wp.array(dtype=wp.vec3)
     indirect_moment2: wp.array(dtype=wp.vec3)
     guide_diffuse: wp.array(dtype=wp.vec3)  # over camera samples, as albedo; empty without a denoiser
@@ -65,5 +67,7 @@ def compose_frame(first: wp.int32, camera_samples: wp.int32, samples: wp.int32, 
         b.variance[i] = variance_of_mean(b.moment1[i], b.moment2[i], n)
         if b.environment_moment1.shape[0] > 0:
             b.variance[i] = b.variance[i] + variance_of_mean(b.environment_moment1[i], b.environment_moment2[i], n)
+        if b.emitters_moment1.shape[0] > 0:
+            b.variance[i] = b.variance[i] + variance_of_mean(b.emitters_moment1[i], b.emitters_moment2[i], n)
         if b.indirect_moment1.shape[0] > 0:
             b.variance[i] = b.variance[i] + variance_of_mean(b.indirect_moment1[i], b.indirect_moment2[i], n)

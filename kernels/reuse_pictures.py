@@ -48,6 +48,7 @@ class IncidentMap:
     rays: wp.int32  # of a texel, anywhere in it
     seed: wp.uint32
     max_depth: wp.int32  # edges of the longest path that is seen, that to the point included; below 2: none
+    roulette_depth: wp.int32  # edges from which paths end at random, that to the point included
     sky_probability: wp.float32  # PathSettings
     sees_sky: wp.int32  # 1: count the sky's light that comes straight
     light: wp.array(dtype=wp.float32)  # [resolution^2] luminance of the mean radiance
@@ -82,7 +83,7 @@ def incident_luminance(scene: SceneData, incident: IncidentMap, direction: wp.ve
     paths = PathSettings()
     paths.terms = TERM_ENVIRONMENT | TERM_EMITTERS | TERM_INDIRECT
     paths.max_depth = incident.max_depth
-    paths.roulette_depth = incident.max_depth
+    paths.roulette_depth = incident.roulette_depth
     paths.sky_probability = incident.sky_probability
     s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
     path = trace_path(scene, PathSamplers(), hit, s, -direction, paths, index, incident.seed, -1)

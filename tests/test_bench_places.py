@@ -11,6 +11,7 @@ from PIL import Image
 import warp_gi as gi
 from warp_gi.bench import (
     blender_peer,
+    compare_reference,
     dvf_peers,
     dvf_views,
     mitsuba_reference,
@@ -35,6 +36,29 @@ BUILT = [name for name, place in PLACES.items() if not place.files]
 
 def cases_of(module: object) -> list[Case]:
     return [value for value in vars(module).values() if isinstance(value, Case)]
+
+
+# ---- references ----
+
+
+def test_references_lose_no_bounces_whatever_the_default_depth_is(monkeypatch):
+    """The pictures that suites measure against have the mean of paths of 64 edges; 8 would lose 7 % here."""
+    place = PLACES["two_rooms"]
+    scene, camera = place.scene(), place.camera().at_resolution(24, 16)
+
+    def mean(picture):
+        return picture.mean(dtype=np.float64)
+
+    deep = gi.Pipeline(indirect=gi.BsdfPaths(max_depth=64), spp=256, camera_samples=1)
+    expected = next(gi.render(scene, camera, deep, seed=5))
+    monkeypatch.setattr(gi.BsdfPaths.__init__, "__defaults__", (8, *gi.BsdfPaths.__init__.__defaults__[1:]))
+    assert gi.BsdfPaths().max_depth == 8
+    compared = compare_reference.computed(scene, camera, "cpu", 1, 256, centred=True)
+    assert mean(compared.picture) == pytest.approx(mean(expected.numpy("beauty")), rel=0.015)
+    probes = probes_views.View(scene, camera, reference_spp=128)
+    assert mean(probes.reference) == pytest.approx(mean(expected.numpy("indirect")), rel=0.03)
+    reuse = reuse_views.Truth(scene, camera, spp=128)
+    assert mean(reuse.mean("indirect")) == pytest.approx(mean(expected.numpy("indirect")), rel=0.03)
 
 
 # ---- the table ----

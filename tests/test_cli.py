@@ -89,7 +89,7 @@ def test_resume_keeps_whole_frames_and_redoes_the_others(unbroken, tmp_path, cap
     "change, reason",
     [
         (["--seed", "2"], "seed is 1 instead of 2"),
-        (["--indirect.max-depth", "3"], "pipeline.indirect.max_depth is 8 instead of 3"),
+        (["--indirect.max-depth", "3"], "pipeline.indirect.max_depth is 64 instead of 3"),
         (["--pipeline", "direct"], "pipeline.indirect is 'BsdfPaths' instead of 'None'"),
         (["--environment", "1,1,1"], "scene_hash"),
         (["--resolution", "12x8"], "24x16 instead of 12x8"),

@@ -8,6 +8,7 @@ import pytest
 import warp_gi as gi
 from warp_gi.bench import dvf, dvf_peers, dvf_views, presets, stages
 from warp_gi.bench.gallery import Gallery
+from warp_gi.techniques import visibility_audit
 
 SIZE = (24, 16)
 
@@ -39,11 +40,12 @@ def test_mode_rows_hold_ratios_and_errors(view, monkeypatch):
 def test_the_audit_counts_exactly_what_the_pictures_differ_by(view):
     coarse = {"rays": 8, "samples": 1, "resolution": 24, "dilation": 0}
     traced, field = view.stage(16, mode="traced"), view.stage(16, **coarse)
-    counts = dvf_views.audit(field)
+    counts = visibility_audit.audit(field.frame, field.state)
     expected = (counts["leaked"] - counts["lost"]) / 16
     assert np.abs(expected).max() > 0.0
     np.testing.assert_allclose(dvf_views.white_error(field, traced), expected, atol=1e-5)
-    assert dvf_views.traced_share(traced, counts) == 1.0
+    asked = visibility_audit.rays_asked(counts)
+    assert np.array_equal(visibility_audit.rays_traced(counts, traced.estimator), asked) and asked.sum() > 0
     assert len(view.bakes) == len(view.bake_seconds)
 
 

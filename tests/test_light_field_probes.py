@@ -286,7 +286,7 @@ def test_modes_agree_with_the_path_tracer():
     """The error of each mode in a simple room is small, and falls as there are more probes."""
     scene = lamp_room()
     camera = view((32, 24))
-    paths = gi.Pipeline(environment=None, emitters=None, indirect=gi.BsdfPaths(max_depth=20), spp=1024)
+    paths = gi.Pipeline(environment=None, emitters=None, indirect=gi.BsdfPaths(max_depth=64), spp=1024)
     reference = next(gi.render(scene, camera, paths, seed=5)).numpy("indirect")
     errors = {}
     for mode in ("irradiance", "traced"):
@@ -303,7 +303,7 @@ def test_glossy_surfaces_reflect_what_probes_saw():
     """A mirror shows the room's lit floor; the mode "irradiance" cannot."""
     mirror = quad((-0.8, -0.8, -0.95), (1.6, 0, 0), (0, 1.6, 0), gi.Material("m", (1, 1, 1), metallic=1, roughness=0.1))
     scene, camera = lamp_room(mirror), view((32, 24))
-    paths = gi.Pipeline(environment=None, emitters=None, indirect=gi.BsdfPaths(max_depth=12), spp=512)
+    paths = gi.Pipeline(environment=None, emitters=None, indirect=gi.BsdfPaths(max_depth=64), spp=512)
     frame = next(gi.render(scene, camera, paths, seed=5))
     on_mirror = frame.numpy("albedo")[..., 0] > 0.95
     reference = frame.numpy("indirect")[on_mirror]

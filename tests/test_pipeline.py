@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warp_gi as gi
 from warp_gi.bench.presets import sphere
 from warp_gi.errors import OptionError
+from warp_gi.kernels.sampling import random_1d
 from warp_gi.launch import set_threads
 
 SIZE = (24, 16)
@@ -195,7 +197,7 @@ def test_metadata_and_timings_tell_how_it_was_made():
     frame = one_frame(seed=9)
     assert frame.metadata["seed"] == 9
     assert frame.metadata["pipeline.indirect"] == "BsdfPaths"
-    assert frame.metadata["pipeline.indirect.max_depth"] == 8
+    assert frame.metadata["pipeline.indirect.max_depth"] == 64
     assert len(frame.metadata["scene_hash"]) == 64
     assert {"bake", "compile", "scene", "primary", "paths", "compose"} <= set(frame.timings)
     assert all(seconds >= 0 for seconds in frame.timings.values())
@@ -214,6 +216,58 @@ def test_variance_predicts_the_spread_over_seeds():
     measured = np.var([f.numpy("beauty") for f in images], axis=0, ddof=1).mean()
     predicted = np.mean([f.numpy("variance") for f in images])
     assert 0.3 * predicted < measured < 1.3 * predicted
+
+
+# Thread: a pixel. Adds samples that are 0 or 1, half of them each.
+@wp.kernel(enable_backward=False)
+def toss_coins(
+    first: wp.int32,
+    samples: wp.int32,
+    seed: wp.uint32,
+    term: wp.array(dtype=wp.vec3),
+    moment1: wp.array(dtype=wp.vec3),
+    moment2: wp.array(dtype=wp.vec3),
+):
+    pixel = first + wp.tid()
+    for sample in range(samples):
+        if random_1d(wp.uint32(pixel), seed, sample) < 0.5:
+            one = wp.vec3(1.0, 1.0, 1.0)
+            term[pixel] = term[pixel] + one
+            moment1[pixel] = moment1[pixel] + one
+            moment2[pixel] = moment2[pixel] + one
+
+
+def trace_coins(estimator, frame, state):
+    """Add samples by a launch of their own, as techniques do that are not path traced with the rest."""
+    settings = frame.pass_settings
+    seed = wp.uint32((frame.seed + settings.camera_sample) & 0xFFFFFFFF)
+    inputs = [settings.sample_count, seed, frame[estimator.term], *frame.moments(estimator.term)]
+    frame.launch(toss_coins, inputs)
+
+
+@pytest.mark.parametrize("estimator", [gi.TracedEnvironment(), gi.PowerLights(), gi.BsdfPaths()], ids=lambda e: e.term)
+def test_moments_of_every_term_reach_the_variance(estimator, monkeypatch):
+    """Coins scatter as the binomial distribution says; path tracing of another term adds its own variance."""
+    monkeypatch.setattr(type(estimator), "trace", trace_coins)
+    nothing = gi.Pipeline(environment=None, emitters=None, indirect=None, spp=8)
+    coins = replace(nothing, **{estimator.term: estimator})
+    nodes = [node for node in lit_scene().nodes if node.name != "glow"]  # nothing that emits is in sight
+    scene = gi.Scene(nodes, environment=(6.0, 8.0, 10.0))
+    frames = list(gi.render(scene, gi.CameraPath.still(camera()), coins, frames=range(48)))
+    scatter = np.var([frame.numpy("beauty") for frame in frames], axis=0, ddof=1).mean()
+    claimed = np.mean([frame.numpy("variance") for frame in frames])
+    assert scatter == pytest.approx(0.25 / 8, rel=0.05) and claimed == pytest.approx(scatter, rel=0.05)
+    if estimator.term != "environment":
+        sky, both = (
+            one_frame(scene, pipeline=replace(one, environment=gi.TracedEnvironment())).numpy("variance").mean()
+            for one in (nothing, coins)
+        )
+        assert both == pytest.approx(sky + 0.25 / 8, rel=0.05) and sky > 0.01
+
+
+def test_moments_of_an_unknown_term_are_an_error():
+    with pytest.raises(OptionError, match="unknown term 'emitter'; did you mean 'emitters'"):
+        one_frame().moments("emitter")
 
 
 def test_a_lamp_that_moved_lights_like_one_that_stands_there():

@@ -258,6 +258,22 @@ def test_light_of_one_bright_wall(sky, sees_sky):
     assert (light[directions[..., 1] < -0.05] == 0).all()
 
 
+def test_light_of_a_white_box_is_all_its_bounces():
+    """Walls that emit 1 and reflect 0.8 send 0.8 + 0.64 + ... = 4 besides what they emit; roulette ends the paths."""
+    glow = gi.Material("glow", (0.8, 0.8, 0.8), specular=0.0, emission=(1.0, 1.0, 1.0))
+    corners = [
+        [(-1, -1, -1), *edges] for edges in (((2, 0, 0), (0, 2, 0)), ((0, 2, 0), (0, 0, 2)), ((0, 0, 2), (2, 0, 0)))
+    ]
+    corners += [[(1, 1, 1), *(tuple(-x for x in edge) for edge in edges)] for _, *edges in corners]
+    box = gi.Scene([gi.Node("box", [quad(*corner, glow) for corner in corners])])
+    inside = gi.Camera.look_at((0.0, 0.5, 0.5), (0.1, -1.0, 0.2), hfov=60, resolution=(9, 9))
+    scheduler, frame = learnt(box, 1, inside, indirect=gi.GuidedPaths())
+    up = np.array([0.0, 1.0, 0.0])
+    light = pictures.incident_light(scheduler, frame, np.array([0.1, -0.999, 0.2]), up)
+    above = texel_directions(pictures.MAP_TEXELS)[..., 1] > 0.1
+    assert light[above].mean() == pytest.approx(4.0, rel=0.02)
+
+
 def test_what_comes_straight_from_emitters_is_left_out():
     scheduler, frame = learnt(wall_scene(lamp=True), 1, camera_above())
     origin, up = np.array([0.1, 0.0, 0.2]), np.array([0.0, 1.0, 0.0])

@@ -11,6 +11,7 @@ import warp_gi as gi
 from warp_gi.bench.presets import sphere
 from warp_gi.errors import BakeError, OptionError
 from warp_gi.launch import set_threads
+from warp_gi.scheduler import MOST_VERTICES
 
 SIZE = (24, 16)
 SPP = 8
@@ -193,9 +194,9 @@ def test_paths_may_be_longer_than_what_is_kept_of_them():
     chosen = pipeline(indirect=gi.GuidedPaths(max_depth=40, roulette_depth=40), spp=1)
     scheduler, frames = sequence([0], closed, chosen)
     records = scheduler._records
-    assert records.vertices == 12 and records.codes.shape[0] % 12 == 0
-    used = (records.codes.numpy().reshape(-1, 12) != 0xFFFFFFFF).sum(axis=1)
-    assert used.max() == 12
+    assert records.vertices == MOST_VERTICES == 7 and records.codes.shape[0] % 7 == 0
+    used = (records.codes.numpy().reshape(-1, 7) != 0xFFFFFFFF).sum(axis=1)
+    assert used.max() == 7
     assert np.isfinite(frames[0]["beauty"]).all()
 
 

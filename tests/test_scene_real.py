@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scene_tools import loss_by_depth
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -78,6 +80,23 @@ def test_sponza_has_holes_in_its_leaves():
     materials = scene.data("cpu").geometry.materials.numpy()
     held = {scene.materials[index].name for index in np.unique(materials[face_masks >= 0])}
     assert held and held <= set(masked)
+
+
+@pytest.mark.parametrize("paths", [gi.BsdfPaths(), gi.GuidedPaths()], ids=["bsdf", "guided"])
+@pytest.mark.parametrize(
+    ("name", "sky", "view"),
+    [
+        ("living_room/living_room.obj", (1.0, 1.0, 1.0), ((0, 1, 4), (0.5, 1.2, 0))),
+        ("modern_hall.glb", None, ((4, 1.7, 2), (-3, 1.6, -0.5))),
+    ],
+)
+def test_the_default_depth_keeps_the_light_of_white_rooms(name, sky, view, paths):
+    """Half a percent of the indirect light is lost at most, where 8 edges would lose 7 to 10."""
+    scene = load(name)
+    scene.environment = sky or scene.environment
+    camera = gi.Camera.look_at(*view, hfov=60)
+    assert loss_by_depth(scene, camera, paths) < 0.005
+    assert loss_by_depth(scene, camera, replace(paths, max_depth=8)) > 0.05
 
 
 @pytest.mark.slow

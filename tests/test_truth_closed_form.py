@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import statistics_tools as st
+from scene_tools import loss_by_depth
 from statistics_tools import every_device  # noqa: F401
 from test_truth_bsdf import MATERIALS, albedo, unit
 
@@ -64,9 +65,9 @@ def test_white_lambert_is_invisible_in_a_white_furnace():
     assert np.abs(image - 1.0).max() < 1e-5
 
 
-def test_glowing_box_sums_its_bounces():
-    """In a closed box that emits 1 and reflects half everywhere, paths of up to n edges carry 2 - 2^(1 - n)."""
-    glow = gi.Material("glow", (0.5, 0.5, 0.5), specular=0.0, emission=(1.0, 1.0, 1.0))
+def glowing_box(albedo: float) -> gi.Scene:
+    """Return a closed box that emits 1 and reflects ``albedo`` everywhere."""
+    glow = gi.Material("glow", (albedo,) * 3, specular=0.0, emission=(1.0, 1.0, 1.0))
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float32)
     faces = [
         [0, 1, 3],
@@ -81,10 +82,28 @@ def test_glowing_box_sums_its_bounces():
         [0, 6, 4],
     ]
     faces += [[1, 5, 7], [1, 7, 3]]
-    scene = scene_of(gi.Mesh(corners, np.array(faces, dtype=np.int32), glow))
-    camera = gi.Camera.look_at((0.2, 0.1, 0.3), (1, 0.3, -0.2), hfov=100, resolution=(16, 16))
+    return scene_of(gi.Mesh(corners, np.array(faces, dtype=np.int32), glow))
+
+
+def camera_in_box() -> gi.Camera:
+    return gi.Camera.look_at((0.2, 0.1, 0.3), (1, 0.3, -0.2), hfov=100, resolution=(16, 16))
+
+
+def test_glowing_box_sums_its_bounces():
+    """In a closed box that emits 1 and reflects half everywhere, paths of up to n edges carry 2 - 2^(1 - n)."""
     for depth in (2, 3, 4, 10):
-        st.assert_mean(st.renderings(scene, camera, path(16, depth), 12), 2.0 - 2.0 ** (1 - depth))
+        images = st.renderings(glowing_box(0.5), camera_in_box(), path(16, depth), 12)
+        st.assert_mean(images, 2.0 - 2.0 ** (1 - depth))
+
+
+@pytest.mark.parametrize("paths", [gi.BsdfPaths(), gi.GuidedPaths()], ids=["bsdf", "guided"])
+@pytest.mark.parametrize("white", [0.8, 0.9])
+def test_the_default_depth_loses_next_to_nothing_in_a_white_box(paths, white):
+    """Indirect light is all bounces, a^2 + a^3 + ...; of that half a percent at most is lost to the greatest depth."""
+    scene, camera = glowing_box(white), camera_in_box()
+    assert loss_by_depth(scene, camera, paths) < 0.005
+    images = st.renderings(scene, camera, gi.Pipeline(indirect=paths, spp=64), 12, "indirect")
+    st.assert_mean(images, white**2 / (1.0 - white), tolerance=0.005)
 
 
 @pytest.mark.parametrize("sky", SKIES)

@@ -93,7 +93,7 @@ class Pipeline:
                 yield term, estimator
 
     def describe(self) -> dict[str, Any]:
-        """Return all settings by dotted name, e.g. {"indirect": "BsdfPaths", "indirect.max_depth": 8, ...}."""
+        """Return all settings by dotted name, e.g. {"indirect": "BsdfPaths", "indirect.max_depth": 64, ...}."""
         settings: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)

@@ -27,7 +27,7 @@ from warp_gi.scene.scene import Scene
 from warp_gi.sequence_state import Dependence, state_arrays, with_arrays
 from warp_gi.techniques.baselines import BsdfPaths, PowerLights, sky_probability
 
-MOST_VERTICES = 12  # of a path whose samples are kept; few paths get further, and each has room for as many
+MOST_VERTICES = 7  # of a path whose samples are kept: each path has room for as many, so more would keep fewer paths
 _VEC3_BUFFERS = ("beauty", "emission", *TERMS, "albedo", "normal", "position", "variance", "moment1", "moment2")
 BUFFERS = (
     "beauty",
@@ -153,7 +153,12 @@ class Frame:
         self.launch_tiled(tracer.trace_paths, inputs)
 
     def moments(self, name: str) -> tuple[wp.array, wp.array]:
-        """Return sums of an independent launch's samples and of their squares, which the variance buffer adds."""
+        """Return sums of an independent launch's samples and of their squares, which the variance buffer adds.
+
+        Both are vec3 [height * width]. ``name`` is the term that the samples are of; raises OptionError for others.
+        """
+        if name not in TERMS:
+            raise unknown_name("term", name, TERMS)
         if self._arrays.get(f"{name}_moment1") is None:
             width, height = self.camera.resolution
             for order in (1, 2):

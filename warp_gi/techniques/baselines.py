@@ -83,8 +83,10 @@ class BsdfPaths(Estimator):
 
     term: ClassVar[str] = "indirect"
 
-    max_depth: int = 8
-    """Edges of the longest path from camera to light: 2 is direct light only, 3 one bounce."""
+    max_depth: int = 64
+    """Edges of the longest path from camera to light: 2 is direct light only, 3 one bounce. In white rooms 8 loses 7 to
+    10 % of the indirect light and 24 loses 0.1 %. Roulette ends nearly all paths sooner, so 64 costs little more than
+    8: at most 7 % more time."""
     roulette_depth: int = 5
     """Paths of this many edges and more end at random, by their throughput or the reflectance they met, the larger."""
     clamp: float = 0.0

@@ -246,6 +246,7 @@ def incident_light(scheduler: FrameScheduler, frame: Frame, origin: np.ndarray, 
     incident.origin, incident.normal = wp.vec3(*origin.tolist()), wp.vec3(*normal.tolist())
     incident.resolution, incident.rays, incident.seed = MAP_TEXELS, MAP_RAYS, frame.seed
     incident.max_depth = pipeline.indirect.max_depth - 1
+    incident.roulette_depth = max(pipeline.indirect.roulette_depth - 1, 2)
     incident.sky_probability = sky_probability(scene)
     incident.sees_sky = int(isinstance(pipeline.environment, TracedEnvironment))
     incident.light = wp.empty(MAP_TEXELS**2, dtype=wp.float32, device=frame.device)

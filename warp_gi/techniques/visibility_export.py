@@ -13,19 +13,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from warp_gi.baking import Bake
 from warp_gi.camera import Camera
 from warp_gi.errors import BakeError, OptionError
 from warp_gi.files import replacing
 from warp_gi.kernels import visibility_field as field_kernels
-from warp_gi.kernels import visibility_field_audit as audit_kernels
 from warp_gi.pipeline import Pipeline
 from warp_gi.preview import tone_map, write_pngs
 from warp_gi.scene.scene import Scene
 from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence import frame_path
+from warp_gi.techniques import visibility_audit
 from warp_gi.techniques.legends import exposure_of, round_above, with_keys, with_scale
 from warp_gi.techniques.octahedral_atlas import (
     MAPPING,
@@ -257,25 +256,12 @@ def _audit(
     pipeline = _sky_only(settings, SHOW_SAMPLES, camera_samples=1)
     scheduler = FrameScheduler(scene, camera, pipeline, device, seed, bakes=[bake])
     frame, state = scheduler.frame(0), scheduler.state("environment")
+    counts = visibility_audit.audit(frame, state)
+    asked, traced = visibility_audit.rays_asked(counts), visibility_audit.rays_traced(counts, settings)
+    share, label = traced / np.maximum(asked, 1), visibility_audit.occlusion_labels(counts)
     width, height = camera.resolution
-    audit = audit_kernels.AuditBuffers()
-    for name in audit_kernels.AuditBuffers.vars:
-        setattr(audit, name, wp.zeros(width * height, dtype=wp.int32, device=frame.device))
-    inputs = [frame.data, frame.camera_data, frame.pass_settings, state.data, state.query, frame.hits, audit]
-    frame.launch_tiled(audit_kernels.audit_field, inputs)
-    names = ("visible", "occluded", "mixed", "unknown")
-    counts = {name: getattr(audit, name).numpy().reshape(height, width).astype(np.float64) for name in names}
-    slots = audit.label.numpy().reshape(height, width)
-    label = np.where(slots < 0, -1, (slots & int(field_kernels.SLOT_LABEL) != 0).astype(np.int32))
-    total, sure = sum(counts.values()), counts["visible"] + counts["occluded"]
-    traced = total - sure
-    if settings.mode == "unbiased":
-        traced = traced + settings.verify * sure
-    elif settings.mode == "paper":
-        one_sided = counts["mixed"] + np.where(label == 1, counts["visible"], counts["occluded"])
-        traced = np.where(label < 0, total, one_sided)
-    surface = total > 0
-    return traced / np.maximum(total, 1.0), label, surface
+    share, label, surface = (image.reshape(height, width) for image in (share, label, asked > 0))
+    return share, label, surface
 
 
 def _maps_picture(bake: Bake) -> np.ndarray:
