@@ -16,7 +16,9 @@ from warp_gi.kernels.light_field import (
     NOTHING,
     SURFEL_EMITS,
     LightField,
+    grid_position,
     irradiance_at,
+    is_outside,
     pack_radiance,
     pack_surfel,
     surfel_distance,
@@ -26,7 +28,14 @@ from warp_gi.kernels.light_field import (
 )
 from warp_gi.kernels.light_field_place import PROBE_FACTOR, sees_back
 from warp_gi.kernels.octahedral import octahedral_decode, octahedral_wrap
-from warp_gi.kernels.path_trace import TERM_EMITTERS, TERM_ENVIRONMENT, PathSamplers, PathSettings, trace_path
+from warp_gi.kernels.path_trace import (
+    TERM_EMITTERS,
+    TERM_ENVIRONMENT,
+    TERM_INDIRECT,
+    PathSamplers,
+    PathSettings,
+    trace_path,
+)
 from warp_gi.kernels.sampling import hash_uint, morton_code, sample_2d
 from warp_gi.kernels.surface import shading_normal, surface_emission, surface_shape, with_color
 from warp_gi.kernels.types import SceneData
@@ -48,7 +57,9 @@ class ProbeWork:
     probes: wp.array(dtype=wp.int32)  # [slot] their indices
     rays: wp.int32  # of a texel: the first is through its middle, the others anywhere in it
     seed: wp.uint32
-    sky_probability: wp.float32  # PathSettings
+    sky_probability: wp.float32  # PathSettings; and the next two, of paths from surfels outside of the grid
+    max_depth: wp.int32
+    roulette_depth: wp.int32
     radius: wp.float32  # metres; distances count as no more than this in the moments
     hysteresis: wp.float32  # share of the old irradiance that is kept
     direct: wp.array(dtype=wp.uint32)  # RGB9E5, reflected direct light
@@ -64,7 +75,8 @@ class ProbeWork:
     distances: wp.array(dtype=wp.vec2)
 
 
-# Direct light that the surface a ray meets reflects back, its reflectance, and what it emits.
+# Direct light that the surface a ray meets reflects back, and its reflectance of what comes from between the probes. Of
+# a surface outside of the grid, where no probe is near, all light is sampled here by a path, and the reflectance is 0.
 @wp.struct
 class TexelSample:
     face: wp.int32
@@ -78,7 +90,13 @@ class TexelSample:
 
 @wp.func
 def sample_texel(
-    scene: SceneData, work: ProbeWork, origin: wp.vec3, direction: wp.vec3, index: wp.uint32, seed: wp.uint32
+    scene: SceneData,
+    field: LightField,
+    work: ProbeWork,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    index: wp.uint32,
+    seed: wp.uint32,
 ) -> TexelSample:
     r = TexelSample()
     hit = bvh_intersect(scene.bvh, origin, direction, float(wp.inf))
@@ -95,10 +113,14 @@ def sample_texel(
     paths = PathSettings()
     paths.terms = TERM_ENVIRONMENT | TERM_EMITTERS
     paths.max_depth = 2
-    paths.roulette_depth = 2
+    paths.roulette_depth = work.roulette_depth
     paths.sky_probability = work.sky_probability
+    if is_outside(field, grid_position(field, s.position)):
+        paths.terms = TERM_ENVIRONMENT | TERM_EMITTERS | TERM_INDIRECT
+        paths.max_depth = work.max_depth
+        r.albedo = wp.vec3(0.0, 0.0, 0.0)
     light = trace_path(scene, PathSamplers(), hit, s, -direction, paths, index, seed, -1)
-    r.direct = light.environment + light.emitters
+    r.direct = light.environment + light.emitters + light.indirect
     return r
 
 
@@ -127,7 +149,7 @@ def trace_texels(first: wp.int32, scene: SceneData, field: LightField, work: Pro
             offset = sample_2d(index + wp.uint32(ray), seed, JITTER_DIMENSION)
         uv = wp.vec2(wp.float32(column) + offset[0], wp.float32(row) + offset[1]) / wp.float32(field.resolution)
         direction = octahedral_decode(uv)
-        s = sample_texel(scene, work, origin, direction, index + wp.uint32(ray), seed)
+        s = sample_texel(scene, field, work, origin, direction, index + wp.uint32(ray), seed)
         direct = direct + s.direct
         albedo = albedo + s.albedo
         if ray == 0:

@@ -16,10 +16,8 @@ from warp_gi.errors import BakeError, OptionError, check_whole, unknown_name
 from warp_gi.estimator import Ahead, Estimator
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_trace as trace_kernels
-from warp_gi.kernels import path_trace
-from warp_gi.techniques.baselines import BsdfPaths, sky_probability
 from warp_gi.techniques.light_field_places import MOST_PROBES, lit_data, map_resolution
-from warp_gi.techniques.light_field_state import ProbeState, sky_bytes
+from warp_gi.techniques.light_field_state import ProbeState, path_settings, sky_bytes
 
 _MODES = {
     "irradiance": trace_kernels.MODE_IRRADIANCE,
@@ -52,13 +50,13 @@ class LightFieldProbes(Estimator):
     """What rays are traced through. "geometry": the scene; what they meet is lit by its direct light, sampled, and by the
     probes' irradiance. "probes": their maps alone, as in the paper, which takes 10 to 30 times as long on a CPU."""
     visibility: Literal["probes", "exact"] = "probes"
-    """Who tells which of the eight probes around a point see it: their maps, or "exact" shadow rays, for less light behind
-    walls at about three times the price. Where none sees it a path is traced."""
+    """Who tells which of the eight probes around a point see it: their maps, or "exact" shadow rays, for less light
+    behind walls at two or three times the price. Where too few see it a path is traced."""
     counts: tuple[int, int, int] = (0, 0, 0)
     """Probes along x, y and z of the box that paths from the camera reach; 0 follows from the spacing."""
     spacing: float = 0.0
-    """Metres between probes; 0 is a twelfth of the longest side, or as much more as it takes for at most 430 probes, 128
-    if no camera is known."""
+    """Metres between probes; 0 is a twelfth of the longest side, or as much more as it takes for at most 440 probes, in
+    rooms 80, and 128 if no camera is known."""
     resolution: int = 0
     """Texels along a side of a probe's map, a multiple of 16; 0 is 128 for up to 128 probes, 64 for more."""
     irradiance_resolution: int = 32
@@ -67,7 +65,7 @@ class LightFieldProbes(Estimator):
     """Rays a texel while baking."""
     bounces: int = 16
     """Most passes of light from probes to probes; the first is light that was reflected once."""
-    tolerance: float = 0.005
+    tolerance: float = 0.002
     """Relative change of the irradiance below which light bounces no more."""
     relocate: bool = True
     """Move probes out of walls, or away from them, by up to half the distance to the next."""
@@ -233,14 +231,6 @@ class LightFieldProbes(Estimator):
         buffers = frame.struct(trace_kernels.ProbeView)
         inputs = [frame.camera_data, frame.pass_settings, state.field, buffers]
         frame.launch_tiled(trace_kernels.view_probes, inputs)
-
-
-def path_settings(scene: Any) -> Any:
-    """Return the settings of paths that go on where probes know nothing: those of a default BsdfPaths."""
-    defaults, paths = BsdfPaths(), path_trace.PathSettings()
-    paths.max_depth, paths.roulette_depth = defaults.max_depth, defaults.roulette_depth
-    paths.sky_probability = sky_probability(scene)
-    return paths
 
 
 def _key(scene: Any, time: float) -> str:

@@ -15,8 +15,8 @@ from warp_gi.baking import Bake
 from warp_gi.camera import Camera, CameraPath
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_bake as bake_kernels
-from warp_gi.kernels import types
-from warp_gi.techniques.baselines import sky_probability
+from warp_gi.kernels import path_trace, types
+from warp_gi.techniques.baselines import BsdfPaths, sky_probability
 from warp_gi.techniques.light_field_places import ProbeGrid, lit_data, map_resolution, place_grid, relocate
 
 LIGHT_RESOLUTION, DISTANCE_RESOLUTION = 32, 64
@@ -194,7 +194,9 @@ class ProbeState:
         work.probes = self._array(probes.astype(np.int32), wp.int32)
         work.rays = rays
         work.seed = (self.seed * 0x9E3779B1 + self.refreshes * 0x85EBCA77 + 1) & 0xFFFFFFFF
-        work.sky_probability = sky_probability(scene)
+        paths = path_settings(scene)
+        for name in ("sky_probability", "max_depth", "roulette_depth"):
+            setattr(work, name, getattr(paths, name))
         work.radius = float(field_kernels.MOMENT_REACH) * float(np.linalg.norm(self.grid.spacing))
         for name in ("direct", "albedo"):
             setattr(work, name, wp.empty(count * texels, dtype=wp.uint32, device=self.device))
@@ -308,6 +310,14 @@ def bounce_changes(bake: Bake) -> list[float]:
     """Return by how much each bounce changed the irradiance of probes, as a share of it; the first is 1."""
     count = sum(name.startswith("change_") for name in bake.counts)
     return [float(bake.counts[f"change_{number + 1}"]) for number in range(count)]
+
+
+def path_settings(scene: Any) -> Any:
+    """Return the settings of paths that go on where probes know nothing: those of a default BsdfPaths."""
+    defaults, paths = BsdfPaths(), path_trace.PathSettings()
+    paths.max_depth, paths.roulette_depth = defaults.max_depth, defaults.roulette_depth
+    paths.sky_probability = sky_probability(scene)
+    return paths
 
 
 def baked_resolution(bake: Bake) -> int:
