@@ -94,7 +94,9 @@ def probe_grid(
     step = spacing or float(extent.max()) / AUTOMATIC_STEPS
 
     def along(step: float) -> tuple[int, ...]:
-        return tuple(int(n) or max(least, round(min(e / step, 1e9))) for n, e in zip(counts, extent, strict=True))
+        rounded = round if spacing else math.ceil
+        steps = np.minimum(extent / step, 1e9)
+        return tuple(int(n) or max(least, rounded(e)) for n, e in zip(counts, steps, strict=True))
 
     if not spacing and not all(counts):
         while math.prod(along(step)) > most and step < extent.max():
