@@ -77,8 +77,8 @@ def lambert(color: wp.vec3) -> Bsdf:
 
 
 # What the GGX lobe reflects of light from everywhere: its directional albedo, averaged over wo by cosine.
-# f = (f0 (1 - s) + f90 s) D V with s = (1 - V.H)^5 is linear in f0 and f90, so the albedo is f0 A + f90 B, where A and B
-# depend on the roughness r alone. Fitted to their integrals over r in [0, 1], with errors of at most 0.0016 and 0.0004;
+# f = (f0 (1 - s) + f90 s) D V with s = (1 - V.H)^5 is linear in f0 and f90, so the albedo is f0 A + f90 B, where A and
+# B depend on the roughness r alone. Fitted to their integrals over r in [0, 1], with errors up to 0.0016 and 0.0004;
 # A + B is below 1, because single scattering loses what microfacets reflect at each other (0.59 of it at r = 1). For a
 # mirror they are means of 1 - (1 - cos)^5 and of (1 - cos)^5: A = 20/21, B = 1/21.
 @wp.func
@@ -89,9 +89,9 @@ def average_specular(b: Bsdf) -> wp.vec3:
     return b.f0 * scale + wp.vec3(b.f90, b.f90, b.f90) * offset
 
 
-# Mean of 1 - F(V.H) over both directions by cosine: the share of its colour that the diffuse lobe reflects. It does not
-# depend on the roughness, and is not 1 - average_specular: for two cosine-distributed directions the mean of (1 - V.H)^5,
-# with V.H the cosine of half the angle between them, is 0.0036946.
+# Mean of 1 - F(V.H) over both directions by cosine: the share of its colour that the diffuse lobe reflects. It does
+# not depend on the roughness, and is not 1 - average_specular: for two cosine-distributed directions the mean of
+# (1 - V.H)^5, with V.H the cosine of half the angle between them, is 0.0036946.
 @wp.func
 def diffuse_share(b: Bsdf) -> wp.vec3:
     f90 = 0.0036946 * b.f90

@@ -1,5 +1,6 @@
 """The estimator of light field probes: what is baked, how it is read, and what reaches the picture."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,16 @@ from warp_gi.kernels import denoise as denoise_kernels
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_bake as bake_kernels
 from warp_gi.techniques.light_field_export import unpack_radiance
-from warp_gi.techniques.light_field_places import ProbeGrid, lit_bounds, lit_data, probe_grid, relocate
+from warp_gi.techniques.light_field_places import (
+    INSET,
+    ProbeGrid,
+    lit_bounds,
+    lit_data,
+    map_resolution,
+    place_grid,
+    probe_grid,
+    relocate,
+)
 from warp_gi.techniques.light_field_state import ProbeState, low_directions
 
 wp.set_module_options({"enable_backward": False})
@@ -114,8 +124,10 @@ def test_grid_follows_counts_and_spacing():
     assert probe_grid(bounds, (3, 1, 2), 0.0, 16).counts == (3, 1, 2)
     assert probe_grid(bounds, (0, 0, 0), 1.0, 16).counts == (8, 2, 4)
     assert probe_grid(bounds, (5, 0, 0), 1.0, 16).counts == (5, 2, 4)
-    automatic = probe_grid(bounds, (0, 0, 0), 0.0, 16)
-    assert 40 <= automatic.probe_count <= 90 and min(automatic.counts) >= 2
+    assert probe_grid(bounds, (4, 0, 0), 0.0, 16, 1).counts == (4, 2, 2)  # what is given is given
+    assert probe_grid(bounds, (0, 0, 0), 0.0, 16).counts == (12, 3, 6)  # a twelfth of the longest side
+    automatic = probe_grid(bounds, (0, 0, 0), 0.0, 16, 80)
+    assert 50 <= automatic.probe_count <= 80 and min(automatic.counts) >= 2
     positions = automatic.positions()
     assert (positions > bounds[0]).all() and (positions < bounds[1]).all()
     np.testing.assert_allclose(positions.mean(axis=0), [4, 1, 2])
@@ -136,24 +148,109 @@ def test_probes_inside_of_something_are_left_out_or_moved():
     assert (np.abs(place - home) <= 0.5 * moved["grid_spacing"] + 1e-6).all()
 
 
-def test_the_grid_fills_the_space_that_is_lit_or_looked_at():
+def dark_room_beside():
     """A lit room, and a dark one beside it behind a wall; a shed outside, which only widens the scene's bounds."""
     wall = gi.Material("wall", (0.6,) * 3, specular=0.0)
     dark = [replace(mesh, points=mesh.points + np.float32([2, 0, 0])) for mesh in walls(wall)]
-    shed = sphere((9, 0, 0), 0.5, wall)
-    nodes = [*lamp_room().nodes, gi.Node("dark", dark), gi.Node("shed", [shed])]
+    return [*lamp_room().nodes, gi.Node("dark", dark), gi.Node("shed", [sphere((9, 0, 0), 0.5, wall)])]
+
+
+def grid_of(scene, camera=None, **settings):
+    return place_grid(scene, gi.LightFieldProbes(**settings), camera, CPU)
+
+
+def box_of(grid, more=0.0):
+    """The box that a grid fills, wider by a share of its cells."""
+    last = grid.low + grid.spacing * (np.array(grid.counts) - 1)
+    return grid.low - (INSET + more) * grid.spacing, last + (INSET + more) * grid.spacing
+
+
+def test_without_a_camera_the_grid_fills_the_space_that_is_lit():
+    nodes = dark_room_beside()
     size = 10.5 / 24  # of a slab along x
     room = lit_bounds(gi.Scene(nodes), CPU)
     assert abs(room[1, 0] - 1) < size + 0.01 and (np.abs(room[:, 1:]) < 1.01).all() and room[0, 0] < -0.99
-    looking = gi.Scene(nodes, cameras={"dark": gi.Camera.look_at((2.5, 0, 0), (1, 0, 0))})
-    assert abs(lit_bounds(looking, CPU)[1, 0] - 3) < size + 0.01
     carried = gi.Node(
         "lamp", lamp_room().nodes[0].meshes[-1:], keyframes=[gi.Keyframe(0.0), gi.Keyframe(1.0, (2, 0, 0))]
     )
     moving = gi.Scene([*nodes, carried])
     np.testing.assert_allclose(lit_bounds(moving, CPU), moving.bounds)
-    unlit = gi.Scene([gi.Node("dark", dark)])
+    unlit = gi.Scene([nodes[1]])
     np.testing.assert_allclose(lit_bounds(unlit, CPU), unlit.bounds)
+    grid = grid_of(gi.Scene(nodes))
+    np.testing.assert_allclose(box_of(grid), room)
+    assert 80 < grid.probe_count <= 128
+
+
+def test_the_grid_is_where_the_camera_is_over_its_whole_path():
+    """In the dark room if it looks there, in both if it goes from one to the other, whichever frames are rendered."""
+    nodes = dark_room_beside()
+    lit, dark = gi.Camera.look_at((0.1, 0, 0.8), (0, 0, 0)), gi.Camera.look_at((2.1, 0, 0.8), (2, 0, 0))
+    low, high = box_of(grid_of(gi.Scene(nodes), dark))
+    np.testing.assert_allclose([low, high], [[1, -1, -1], [3, 1, 1]], atol=0.03)
+    both = gi.CameraPath.from_cameras([lit, dark], times=[0.0, 4.0])
+    low, high = box_of(grid_of(gi.Scene(nodes), both))
+    np.testing.assert_allclose([low, high], [[-1, -1, -1], [3, 1, 1]], atol=0.03)
+    named = gi.Scene(nodes, cameras={"lit": lit, "dark": dark})  # the scene's own cameras, if none is given
+    np.testing.assert_allclose(box_of(grid_of(named)), [low, high], atol=0.03)
+    scheduler = gi.FrameScheduler(gi.Scene(nodes), both.at_resolution(8, 6), indirect_only(**SMALL))
+    scheduler.frame(0)
+    np.testing.assert_allclose(scheduler.state("indirect").grid.low, grid_of(gi.Scene(nodes), both, **SMALL).low)
+
+
+@pytest.mark.parametrize("zenith", [1.0, 150.0])
+@pytest.mark.parametrize("target", [(1.5, 1.2, 0.3), (0.2, 9.0, 0.1)], ids=["across", "up"])
+def test_the_grid_holds_all_that_a_camera_on_the_floor_of_a_court_sees(zenith, target):
+    """Whatever light there is above: each first hit lies in the box, or within half a cell of it."""
+    sides = [mesh for mesh in walls(gi.Material("wall", (0.5,) * 3, specular=0.0)) if mesh.name != "wall1"]
+    court = [replace(mesh, points=(mesh.points + np.float32([0, 1, 0])) * np.float32([2, 5, 2])) for mesh in sides]
+    sky = np.ones((16, 32, 3), np.float32)
+    sky[:2] = zenith
+    scene = gi.Scene([gi.Node("court", court)], environment=gi.Environment(pixels=sky))
+    camera = gi.Camera.look_at((-1.2, 0.6, -0.9), target, up=(0.1, 1, 0), hfov=70, resolution=(64, 36))
+    low, high = box_of(grid_of(scene, camera), 0.5)
+    frame = next(gi.render(scene, camera, gi.Pipeline.preset("direct", spp=1)))
+    seen = frame.numpy("position")[np.isfinite(frame.numpy("depth"))]
+    assert len(seen) > 500
+    assert ((seen > low) & (seen < high)).all()
+
+
+def test_a_large_ground_does_not_stretch_the_grid():
+    """A room with a door on a plane of 222 m: seen from inside, and from outside."""
+    wall = gi.Material("wall", (0.6,) * 3, specular=0.0)
+    sides = [mesh for mesh in walls(wall, 4.0) if mesh.name != "wall0"]
+    door = quad((-2, -2, 2), (3, 0, 0), (0, 4, 0), wall), quad((1, 0.5, 2), (1, 0, 0), (0, 1.5, 0), wall)
+    ground = quad((-111, -2.01, 111), (222, 0, 0), (0, 0, -222), wall, "ground")
+    scene = gi.Scene([gi.Node("all", [*sides[:-1], *door, ground])], environment=1.0)
+    inside = grid_of(scene, gi.Camera.look_at((-1, 0, -1.5), (1, -0.2, 1.5)))
+    low, high = box_of(inside)
+    assert (high - low).max() < 6 and (low < [-1.9, -1.9, -1.9]).all() and inside.probe_count <= 440
+    outside = grid_of(scene, gi.Camera.look_at((7, 1, 9), (0, -1, 0)))
+    low, high = box_of(outside)
+    assert 10 < (high - low).max() < 80 and outside.probe_count <= 440
+    assert grid_of(scene).probe_count <= 128
+
+
+def test_rooms_have_fewer_probes_of_finer_maps():
+    court = gi.Scene(room(0.5, 0.0).nodes[:0] + [gi.Node("court", walls(gi.Material("w", (0.5,) * 3))[2:])])
+    closed, open_ended = grid_of(lamp_room(), view()), grid_of(court, view())
+    assert 40 < closed.probe_count <= 80 < open_ended.probe_count <= 440
+    assert map_resolution(0, closed.probe_count) == 128 and map_resolution(0, open_ended.probe_count) == 64
+    assert map_resolution(32, 8) == 32
+
+
+def test_a_bake_tells_what_it_takes_before_it_starts(caplog):
+    told = []
+    with caplog.at_level("INFO", "warp_gi"):
+        gi.bake(
+            lamp_room(),
+            gi.LightFieldProbes(rays=1, bounces=1),
+            camera_path=view(),
+            progress=lambda stage, share: told.append(len(caplog.messages)),
+        )
+    (line,) = caplog.messages
+    assert re.fullmatch(r"probes: 4 x 4 x 4 of 128 x 128 texels, [\d. x]+ m apart; \d+ MB, about \d+ s to bake", line)
+    assert told[0] == 1
 
 
 def test_probes_at_the_border_move_into_the_light():

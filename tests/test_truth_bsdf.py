@@ -265,7 +265,9 @@ def test_average_reflectance_is_the_mean_of_samples(base, metallic, specular, ro
     np.testing.assert_allclose(averages(base, metallic, roughness, specular)[1], reflected, atol=0.003)
 
 
-@pytest.mark.parametrize("roughness, albedo", [(0.03, 0.086), (0.28, 0.075), (0.53, 0.050), (0.72, 0.035), (0.9, 0.024)])
+@pytest.mark.parametrize(
+    "roughness, albedo", [(0.03, 0.086), (0.28, 0.075), (0.53, 0.050), (0.72, 0.035), (0.9, 0.024)]
+)
 def test_the_coat_of_rough_dielectrics_reflects_less_than_a_mirror(roughness, albedo):
     """Directional albedo of GGX with f0 = 0.04, averaged by cosine; integrated apart, to three digits."""
     np.testing.assert_allclose(averages((0, 0, 0), 0.0, roughness, 1.0)[0], albedo, atol=0.0012)

@@ -30,8 +30,8 @@ what is baked, and which settings there are; --technique NAME --help lists them.
 
   visibility-field     Which way the sky is seen, in the cells that the camera path sees.
                        Of the geometry alone: one bake serves every sky.
-  light-field-probes   The light all around each point of a grid over the space that is lit,
-                       under the scene's sky.
+  light-field-probes   The light all around each point of a grid, under the scene's sky, over
+                       the space that paths from the camera reach, wherever it goes.
 
   warp-gi bake hall.glb --cell-size 0.5 --camera path.json
   warp-gi bake hall.glb --everywhere --export out/hall.png -o out/hall.dvf.safetensors

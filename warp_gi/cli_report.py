@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import logging
 import math
 import os
 import sys
@@ -38,6 +39,9 @@ class Reporter:
         self._total = self._done = 0
         self._seconds: list[float] = []
         self._begin_frame()
+        log = logging.getLogger("warp_gi")
+        log.handlers[:] = [_Lines(self)]
+        log.setLevel(logging.INFO)
 
     def line(self, text: str) -> None:
         """Print a line, above the bar if there is one."""
@@ -156,6 +160,17 @@ class Reporter:
         """Print a table; numbers are set to the right."""
         if not self.quiet:
             print_table(title, columns, rows)
+
+
+class _Lines(logging.Handler):
+    """Prints what the library logs, as lines of a reporter."""
+
+    def __init__(self, reporter: Reporter) -> None:
+        super().__init__()
+        self.reporter = reporter
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.reporter.line(record.getMessage())
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]], names: Sequence[int] = (0,)) -> None:

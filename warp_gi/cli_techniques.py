@@ -112,7 +112,7 @@ def _check_probes(settings: LightFieldProbes, everywhere: bool) -> None:
 
 
 def _check_grid(settings: LightFieldProbes, scene: Scene) -> None:
-    if all(settings.counts):  # else the grid follows from where light reaches, which is for the bake to find out
+    if all(settings.counts):  # else the grid follows from what the camera reaches, which is for the bake to find out
         probe_grid(scene.bounds, settings.counts, settings.spacing, settings.largest_map)
 
 
@@ -170,7 +170,7 @@ TECHNIQUES = {
         settings=LightFieldProbes,
         short_name="probes",
         exported="atlases",
-        is_of_view=False,
+        is_of_view=True,
         check=_check_probes,
         check_scene=_check_grid,
         check_export_name=light_field_export.check_export_name,

@@ -106,6 +106,9 @@ class Estimator:
         """
         return None
 
+    def check_view(self, bake: Bake, camera: Camera | CameraPath) -> None:
+        """Warn if a bake, of this scene and with these settings, was made for another camera than will look at it."""
+
     def start(self, scene: Scene, device: str, bake: Bake | None, seed: int = 0) -> Any:
         """Return the state before the first frame."""
         return None

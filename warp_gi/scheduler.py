@@ -306,9 +306,12 @@ class FrameScheduler:
             self._progress(f"bake {term}", 0.0)
             told = lambda share: self._progress(f"bake {term}", share)  # noqa: E731
             bake = estimator.bake(self.scene, device, self.seed, told, self.camera)
+            if bake is not None:  # what it depends on, the whole camera path for one, decides pixels, too
+                self._bake_digests[f"bake.{term}"] = bake.digest[:16]
         elif not isinstance(self.scene, BakedScene):
             settings = estimator.bake_settings(self.scene)
             bake.check(type(estimator).__name__, estimator.bake_key(self.scene), settings, self.scene.name)
+            estimator.check_view(bake, self.camera)
         return estimator.start(self.scene, device, bake, self.seed)
 
     def state(self, term: str) -> Any:

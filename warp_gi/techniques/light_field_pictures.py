@@ -8,17 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from warp_gi.baking import Bake
 from warp_gi.camera import Camera
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_march as march_kernels
+from warp_gi.kernels import light_field_trace as trace_kernels
 from warp_gi.pipeline import Pipeline
 from warp_gi.preview import magma, tone_map, write_pngs
 from warp_gi.scene.scene import Scene
 from warp_gi.scheduler import Frame, FrameScheduler
 from warp_gi.techniques.legends import exposure_of, label_font, scale_bar, stacked, with_keys
 from warp_gi.techniques.light_field_export import probe_maps
+from warp_gi.techniques.light_field_probes import VISIBILITIES
 from warp_gi.techniques.light_field_ray import draw_ray, march_rays, probe_color, ray_looks
 
 SHOW_SAMPLES = 16
@@ -30,6 +33,7 @@ MOST_TILES, MOST_COLUMNS = 2500, 200
 """Maps in such a picture, and across it."""
 MOST_NUMBERS = 150
 """Probes in view up to which each has its number."""
+UNSEEN_COLOR = (0, 158, 115)  # of Okabe and Ito's palette, too
 SKY_COLOR = (86, 180, 233)  # of Okabe and Ito's palette
 CANDIDATES = 8
 """Rays that are followed look by look to find one whose path shows much."""
@@ -48,7 +52,8 @@ def write_pictures(
     """Write what probes hold, where they stand and how a ray finds its way through them; return the paths.
 
     radiance.png, distance.png, normal.png, irradiance.png: the maps of all probes, with the colour and number of each.
-    places.png: the probes in a view of the scene (light_field_probes.txt, Fig. 1). ray.png: the path of a ray that a
+    places.png: the probes in a view of the scene (light_field_probes.txt, Fig. 1). seen.png: how many of the probes
+    around it see each point of the view. ray.png: the path of a ray that a
     pixel of the view reflects, one that asks several probes if there is one (Fig. 4).
 
     Args:
@@ -68,7 +73,8 @@ def write_pictures(
     exposure = exposure_of(bake.arrays["irradiance"].astype(np.float64) / math.pi)
     origin, direction = _telling_ray(frame, state)
     pictures = _sheets(bake, exposure)
-    pictures |= {"places": draw_places(frame, state), "ray": draw_ray(state, origin, direction, exposure)}
+    pictures |= {"places": draw_places(frame, state), "seen": draw_seen(frame, state)}
+    pictures["ray"] = draw_ray(state, origin, direction, exposure)
     return write_pngs(folder, pictures)
 
 
@@ -200,6 +206,35 @@ def draw_places(frame: Frame, state: Any) -> np.ndarray:
     if covered[inside].any():
         title += "; crossed out: covered, not used"
     return with_keys(np.asarray(image.convert("RGB")), (), title)
+
+
+# ---- who sees what ----
+
+
+def probes_in_sight(frame: Frame, state: Any) -> np.ndarray:
+    """Return how many of the eight probes around it see what a pixel of the last camera sample shows.
+
+    int32 [height, width]: 0 where too few do and paths are traced, -1 where there is no surface.
+    """
+    width, height = frame.camera.resolution
+    counts = wp.empty(width * height, dtype=wp.int32, device=frame.device)
+    visibility = VISIBILITIES[state.settings.visibility]
+    frame.launch(trace_kernels.count_probes, [frame.data, state.field, visibility, frame.hits, counts])
+    return counts.numpy().reshape(height, width)
+
+
+def draw_seen(frame: Frame, state: Any) -> np.ndarray:
+    """Return ``probes_in_sight`` in colours, shaded as the frame is, uint8 [height + legend, width, 3]."""
+    counts = probes_in_sight(frame, state)
+    colors = np.concatenate([[UNSEEN_COLOR], magma(np.arange(1, 9) / 9)]).astype(np.uint8)
+    shade = tone_map(frame.numpy("beauty"), exposure_of(frame.numpy("beauty"))).mean(axis=-1, keepdims=True) / 255
+    image = colors[np.maximum(counts, 0)] * (0.55 + 0.45 * shade)
+    image[counts < 0] = 255
+    surface = counts >= 0
+    unseen = float((counts == 0).sum() / max(surface.sum(), 1))
+    keys = [(tuple(map(int, colors[n])), str(n) if n else "too few: paths are traced") for n in range(9)]
+    title = f"probes, of the eight around it, that see a point; {unseen:.1%} of the surface in view is left to paths"
+    return with_keys(image.astype(np.uint8), tuple(keys), title)
 
 
 # ---- rays ----

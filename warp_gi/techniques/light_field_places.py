@@ -1,8 +1,8 @@
 """Where light field probes stand: the box that the grid fills, and the way out of walls and into the light.
 
-The box is that of what paths from the camera reach, over the whole of its path: all that a picture shows, and what lights
-that over one more surface. Bounds of a scene reach behind its walls, to lamps above the ceiling and to the end of its
-ground; and what is brightly lit may be nowhere near the camera.
+The box is that of what paths from the camera reach, over the whole of its path: all that a picture shows, and what
+lights that over one more surface. Bounds of a scene reach behind its walls, to lamps above the ceiling and to the end
+of its ground; and what is brightly lit may be nowhere near the camera.
 """
 
 from __future__ import annotations
@@ -140,6 +140,12 @@ def cameras_of(camera: Camera | CameraPath | None) -> list[Camera]:
         return [camera]
     frames = np.linspace(0, camera.frame_count - 1, min(camera.frame_count, REACH_CAMERAS))
     return [camera.camera(int(frame)) for frame in np.unique(np.round(frames))]
+
+
+def camera_rows(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return what decides what cameras see but for their pictures' shape, float32 [camera, 13]."""
+    rows = [[*camera.world_from_camera[:3].ravel(), camera.hfov] for camera in cameras]
+    return np.array(rows, np.float32).reshape(-1, 13)
 
 
 class Space(NamedTuple):

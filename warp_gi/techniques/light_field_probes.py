@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
@@ -16,7 +17,7 @@ from warp_gi.errors import BakeError, OptionError, check_whole, unknown_name
 from warp_gi.estimator import Ahead, Estimator
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_trace as trace_kernels
-from warp_gi.techniques.light_field_places import MOST_PROBES, lit_data, map_resolution
+from warp_gi.techniques.light_field_places import MOST_PROBES, camera_rows, cameras_of, lit_data, map_resolution
 from warp_gi.techniques.light_field_state import ProbeState, path_settings, sky_bytes
 
 _MODES = {
@@ -25,10 +26,12 @@ _MODES = {
     "traced": trace_kernels.MODE_TRACED,
 }
 _THROUGH = {"geometry": trace_kernels.RAYS_GEOMETRY, "probes": trace_kernels.RAYS_PROBES}
-_VISIBILITIES = {"probes": trace_kernels.VISIBILITY_PROBES, "exact": trace_kernels.VISIBILITY_EXACT}
+VISIBILITIES = {"probes": trace_kernels.VISIBILITY_PROBES, "exact": trace_kernels.VISIBILITY_EXACT}
 _PRIMARIES = ("geometry", "probes")
 _WEIGHTS = ("visibility", "trilinear")
 MOST_RESOLUTION = 1024
+SAME_VIEW = 1e-4
+"""Share of its size by which a number of a camera may differ from that of one that a bake was made for."""
 SETTLED = 0.02
 """Share of an old state that may be left in the irradiance when a probe counts as refreshed."""
 
@@ -47,8 +50,8 @@ class LightFieldProbes(Estimator):
     """"irradiance" reads filtered irradiance and has no noise; "hybrid" does so for the diffuse part and traces rays
     for the glossy one; "traced" traces rays for all."""
     through: Literal["geometry", "probes"] = "geometry"
-    """What rays are traced through. "geometry": the scene; what they meet is lit by its direct light, sampled, and by the
-    probes' irradiance. "probes": their maps alone, as in the paper, which takes 10 to 30 times as long on a CPU."""
+    """What rays are traced through. "geometry": the scene; what they meet is lit by its direct light, sampled, and by
+    the probes' irradiance. "probes": their maps alone, as in the paper, which takes many times as long on a CPU."""
     visibility: Literal["probes", "exact"] = "probes"
     """Who tells which of the eight probes around a point see it: their maps, or "exact" shadow rays, for less light
     behind walls at two or three times the price. Where too few see it a path is traced."""
@@ -88,7 +91,7 @@ class LightFieldProbes(Estimator):
             ("mode", self.mode, _MODES),
             ("primary", self.primary, _PRIMARIES),
             ("through", self.through, _THROUGH),
-            ("visibility", self.visibility, _VISIBILITIES),
+            ("visibility", self.visibility, VISIBILITIES),
             ("weights", self.weights, _WEIGHTS),
         ):
             if value not in known:
@@ -141,7 +144,11 @@ class LightFieldProbes(Estimator):
         progress: Callable[[float], None] | None = None,
         camera: Camera | CameraPath | None = None,
     ) -> Bake:
-        """Return the probes' maps, for the scene's sky and its pose at time 0."""
+        """Return the probes' maps, for the scene's sky and its pose at time 0.
+
+        The grid is that of ``light_field_places.place_grid``: around what ``camera`` reaches over its whole path, or
+        the scene's own cameras. What it will take is logged before it starts (logger "warp_gi", level INFO).
+        """
         target = launch.get_device(device)
         scene.update(0.0, None, target)
         state = ProbeState(scene, target, self, seed, camera=camera)
@@ -157,6 +164,20 @@ class LightFieldProbes(Estimator):
             state.fill(scene, lit_data(scene, target))
         state.key = _key(scene, 0.0)
         return state
+
+    def check_view(self, bake: Bake, camera: Camera | CameraPath) -> None:
+        """Warn if a bake was made for another camera path: where its probes see nothing, paths are traced."""
+        made_for, wanted = bake.arrays["cameras"], camera_rows(cameras_of(camera))
+        known = (
+            np.abs(wanted[:, None] - made_for).max(axis=2)
+            <= SAME_VIEW * np.maximum(np.abs(wanted).max(axis=1), 1)[:, None]
+        )
+        if not known.any(axis=1).all():
+            warnings.warn(
+                f"this bake of probes was made {'for another camera path' if len(made_for) else 'without a camera'}; "
+                "where too few of its probes see a surface, paths are traced, with noise: bake with this camera instead",
+                stacklevel=2,
+            )
 
     def fitting(self, bake: Bake) -> LightFieldProbes:
         """Return these settings with those that a bake depends on replaced by its own.
@@ -208,7 +229,7 @@ class LightFieldProbes(Estimator):
         settings = frame.pass_settings
         query = trace_kernels.ProbeQuery()
         query.mode, query.through = _MODES[self.mode], _THROUGH[self.through]
-        query.visibility = _VISIBILITIES[self.visibility]
+        query.visibility = VISIBILITIES[self.visibility]
         query.samples, query.first_sample = settings.sample_count, settings.first_sample
         query.sample_bits = settings.sample_bits
         query.rays, query.first_ray, query.ray_bits = query.samples, query.first_sample, query.sample_bits

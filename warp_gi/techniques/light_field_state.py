@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import logging
 import math
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -17,7 +19,15 @@ from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_bake as bake_kernels
 from warp_gi.kernels import path_trace, types
 from warp_gi.techniques.baselines import BsdfPaths, sky_probability
-from warp_gi.techniques.light_field_places import ProbeGrid, lit_data, map_resolution, place_grid, relocate
+from warp_gi.techniques.light_field_places import (
+    ProbeGrid,
+    camera_rows,
+    cameras_of,
+    lit_data,
+    map_resolution,
+    place_grid,
+    relocate,
+)
 
 LIGHT_RESOLUTION, DISTANCE_RESOLUTION = 32, 64
 """Texels along a side of what irradiance and moments are filtered from, each the mean over the texels in it."""
@@ -32,6 +42,10 @@ LEAST_SEEN = 0.25
 niches and under stairs fewer do, and what they know is the light in front."""
 BATCH_TEXELS = 1 << 20
 """Traced between two reports of progress."""
+ANNOUNCED_TEXELS, TRIED_PROBES, TYPICAL_BOUNCES = 1 << 18, 8, 10
+"""Texels from which on a bake says how long it takes, and by how many probes and bounces it finds out."""
+_WORK_BYTES = 9  # of ProbeWork a texel, beside emission
+_log = logging.getLogger("warp_gi")
 
 
 def low_directions(resolution: int) -> np.ndarray:
@@ -133,7 +147,32 @@ class ProbeState:
         data = lit_data(scene, self.device)
         if self.settings.relocate:
             relocate(scene, data, self.grid, self.field, self.device)
+        self._announce(scene, data)
         self.fill(scene, data, progress)
+
+    def _announce(self, scene: Any, data: types.SceneData) -> None:
+        """Log how many probes there are, and what filling them takes: memory, and seconds if it is more than a moment."""
+        count, texels = self.grid.probe_count, self.resolution**2
+        memory = self.nbytes + count * texels * (_WORK_BYTES + 4 * (scene.emitter_count > 0))
+        text = f"probes: {' x '.join(map(str, self.grid.counts))} of {self.resolution} x {self.resolution} texels, "
+        text += f"{' x '.join(f'{step:.3g}' for step in self.grid.spacing)} m apart; {memory / 1e6:,.0f} MB"
+        if count * texels > ANNOUNCED_TEXELS:
+            text += f", about {max(self._seconds(scene, data), 1):.0f} s to bake"
+        _log.info(text)
+
+    def _seconds(self, scene: Any, data: types.SceneData) -> float:
+        """Return about how many seconds it takes to fill the probes, by filling some of them once."""
+        few = np.unique(np.linspace(0, self.grid.probe_count - 1, TRIED_PROBES).astype(int))
+        work = self._work(few, 1, scene, with_emission=False)
+        seconds = []
+        for step in (lambda: self._trace(data, work, few), lambda: self._bounce(work, len(few))):
+            started, compiled = time.perf_counter(), launch.compile_seconds
+            step()
+            wp.synchronize_device(self.device)
+            seconds.append(time.perf_counter() - started - (launch.compile_seconds - compiled))
+        self.field.irradiance.zero_()
+        all_of = self.grid.probe_count / len(few)
+        return all_of * (seconds[0] * self.settings.rays + seconds[1] * min(TYPICAL_BOUNCES, self.settings.bounces))
 
     def fill(self, scene: Any, data: types.SceneData, progress: Callable[[float], None] | None = None) -> None:
         """Trace all probes where they stand, and let light bounce between them until it changes no more."""
@@ -275,6 +314,7 @@ class ProbeState:
             "grid_counts": np.array(self.grid.counts, np.int32),
             "bounds": scene.bounds,
             "sky": sky_bytes(scene),
+            "cameras": camera_rows(cameras_of(self.camera) or list(scene.cameras.values())),
         }
         counts = {
             "probes": self.grid.probe_count,
