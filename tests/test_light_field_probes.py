@@ -218,10 +218,10 @@ def test_the_grid_holds_all_that_a_camera_on_the_floor_of_a_court_sees(zenith, t
 def test_a_large_ground_does_not_stretch_the_grid():
     """A room with a door on a plane of 222 m: seen from inside, and from outside."""
     wall = gi.Material("wall", (0.6,) * 3, specular=0.0)
-    sides = [mesh for mesh in walls(wall, 4.0) if mesh.name != "wall0"]
+    sides = [mesh for mesh in walls(wall, 4.0) if mesh.name != "wall3"]
     door = quad((-2, -2, 2), (3, 0, 0), (0, 4, 0), wall), quad((1, 0.5, 2), (1, 0, 0), (0, 1.5, 0), wall)
     ground = quad((-111, -2.01, 111), (222, 0, 0), (0, 0, -222), wall, "ground")
-    scene = gi.Scene([gi.Node("all", [*sides[:-1], *door, ground])], environment=1.0)
+    scene = gi.Scene([gi.Node("all", [*sides, *door, ground])], environment=1.0)
     inside = grid_of(scene, gi.Camera.look_at((-1, 0, -1.5), (1, -0.2, 1.5)))
     low, high = box_of(inside)
     assert (high - low).max() < 6 and (low < [-1.9, -1.9, -1.9]).all() and inside.probe_count <= 440
@@ -232,7 +232,7 @@ def test_a_large_ground_does_not_stretch_the_grid():
 
 
 def test_rooms_have_fewer_probes_of_finer_maps():
-    court = gi.Scene(room(0.5, 0.0).nodes[:0] + [gi.Node("court", walls(gi.Material("w", (0.5,) * 3))[2:])])
+    court = gi.Scene([gi.Node("court", walls(gi.Material("wall", (0.5,) * 3))[2:])])
     closed, open_ended = grid_of(lamp_room(), view()), grid_of(court, view())
     assert 40 < closed.probe_count <= 80 < open_ended.probe_count <= 440
     assert map_resolution(0, closed.probe_count) == 128 and map_resolution(0, open_ended.probe_count) == 64
@@ -431,7 +431,7 @@ def test_threads_do_not_change_a_bit():
 
 def test_a_saved_bake_renders_the_same_and_fits_only_its_scene(tmp_path):
     scene = lamp_room(environment=(0.2, 0.2, 0.2))
-    bake = gi.bake(scene, gi.LightFieldProbes(**SMALL), seed=1)
+    bake = gi.bake(scene, gi.LightFieldProbes(**SMALL), seed=1, camera_path=view())
     loaded = gi.load_bake(bake.save(tmp_path / "room.probes.safetensors"))
     assert loaded.digest == bake.digest
     np.testing.assert_array_equal(indirect(scene, bakes=[loaded], **SMALL), indirect(scene, **SMALL))
@@ -642,7 +642,7 @@ def test_preset_and_defaults():
     pipeline = gi.Pipeline.preset("probes", spp=4)
     assert isinstance(pipeline.indirect, gi.LightFieldProbes)
     assert replace(pipeline.indirect, mode="traced").mode == "traced"
-    assert pipeline.describe()["indirect.resolution"] == 256
+    assert pipeline.describe()["indirect.resolution"] == 0
 
 
 # ---- without geometry ----

@@ -98,7 +98,7 @@ class LightFieldProbes(Estimator):
                 raise unknown_name(f"{name} of light field probes", value, known)
         block = int(field_kernels.BLOCK)
         for name, least, most in (
-            ("resolution", 0, MOST_RESOLUTION),
+            ("resolution", block if self.resolution else 0, MOST_RESOLUTION),
             ("irradiance_resolution", 4, 128),
             ("rays", 1, 1024),
             ("bounces", 1, 1000),
@@ -174,7 +174,7 @@ class LightFieldProbes(Estimator):
         )
         if not known.any(axis=1).all():
             warnings.warn(
-                f"this bake of probes was made {'for another camera path' if len(made_for) else 'without a camera'}; "
+                f"this bake of probes is {'of another camera path' if len(made_for) else 'of no camera'}: "
                 "where too few of its probes see a surface, paths are traced, with noise: bake with this camera instead",
                 stacklevel=2,
             )

@@ -151,7 +151,7 @@ class ProbeState:
         self.fill(scene, data, progress)
 
     def _announce(self, scene: Any, data: types.SceneData) -> None:
-        """Log how many probes there are, and what filling them takes: memory, and seconds if it is more than a moment."""
+        """Log how many probes there are, and what filling them takes: memory, and seconds if it is not a moment."""
         count, texels = self.grid.probe_count, self.resolution**2
         memory = self.nbytes + count * texels * (_WORK_BYTES + 4 * (scene.emitter_count > 0))
         text = f"probes: {' x '.join(map(str, self.grid.counts))} of {self.resolution} x {self.resolution} texels, "
