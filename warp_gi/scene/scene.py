@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from warp_gi.errors import SceneError, unknown_name
+from warp_gi.forks import Guard
 from warp_gi.kernels import types
 from warp_gi.launch import get_device, on_device
 from warp_gi.scene import animation, emitters, geometry, textures
@@ -47,6 +48,7 @@ class Scene:
         name: str = "scene",
         camera_nodes: Mapping[str, int] | None = None,
     ) -> None:
+        self._guard = Guard()
         self.name = name
         self.version = 0
         """Counts up when the environment or the animation is replaced: what was derived from the scene is stale."""
@@ -79,6 +81,14 @@ class Scene:
     # ---- what is in it ----
 
     @property
+    def lock(self) -> Any:
+        """A re-entrant lock: whoever holds it, as each frame and bake does, is the only one to move or edit the scene.
+
+        Take it around ``update`` and what is read after it, where other threads render.
+        """
+        return self._guard.lock
+
+    @property
     def environment(self) -> Environment | None:
         """The sky; set it to a path, an RGB radiance, an Environment, a SunSky or None. The geometry stays built."""
         return self._environment
@@ -89,10 +99,11 @@ class Scene:
             from warp_gi.scene.environment import as_environment
 
             value = as_environment(value)
-        self._environment = value
-        self.version += 1
-        for device_scene in self._devices.values():
-            device_scene.set_environment(value)
+        with self.lock:
+            self._environment = value
+            self.version += 1
+            for device_scene in self._devices.values():
+                device_scene.set_environment(value)
 
     @property
     def triangle_count(self) -> int:
@@ -211,8 +222,9 @@ class Scene:
         if len(matches) > 1:
             raise SceneError(f"{len(matches)} nodes are named {node!r}; give the one to animate a name of its own")
         animation.check_keyframes(keyframes, node)
-        self.nodes[matches[0]].keyframes = list(keyframes)
-        self._flatten()
+        with self.lock:
+            self.nodes[matches[0]].keyframes = list(keyframes)
+            self._flatten()
 
     def moves(self, index: int) -> bool:
         """Return whether node ``index``, or one above it, has keyframes."""
@@ -245,8 +257,9 @@ class Scene:
         """
         if not self.is_animated:
             return False
-        self.data(device)
-        return self._devices[_device(device).alias].move(time, time if previous_time is None else previous_time)
+        with self.lock:
+            self.data(device)
+            return self._devices[_device(device).alias].move(time, time if previous_time is None else previous_time)
 
     # ---- what kernels read ----
 
@@ -256,9 +269,10 @@ class Scene:
         The alias tables of the emitters are empty: each light sampler fills its own.
         """
         device = _device(device)
-        if device.alias not in self._devices:
-            self._devices[device.alias] = _DeviceScene(self, device)
-        return self._devices[device.alias].data
+        with self.lock:
+            if device.alias not in self._devices:
+                self._devices[device.alias] = _DeviceScene(self, device)
+            return self._devices[device.alias].data
 
     def bvh(self, device: str | wp.Device | None = None) -> Any:
         """Return the TriangleBvh behind ``data(device)``."""
@@ -267,8 +281,9 @@ class Scene:
 
     def resting_bvh(self, device: str | wp.Device | None = None) -> Any:
         """Return a TriangleBvh of what never moves; ``bvh`` itself if nothing does."""
-        self.data(device)
-        return self._devices[_device(device).alias].resting_bvh()
+        with self.lock:
+            self.data(device)
+            return self._devices[_device(device).alias].resting_bvh()
 
     def _all_bounds(self) -> np.ndarray:
         flat = self._flat
@@ -291,7 +306,8 @@ class _DeviceScene:
         from warp_gi.scene.masks import alpha_masks
 
         self.scene, self.device = scene, device
-        self.world = self.previous_world = animation.world_matrices(scene.nodes, 0.0)
+        self.world: list[Any] = animation.world_matrices(scene.nodes, 0.0)
+        self.previous_world = self.world
         flat = scene._flat
         if scene.is_animated:
             flat = replace(flat, points=flat.points.copy(), normals=flat.normals.copy())
@@ -356,12 +372,14 @@ class _DeviceScene:
         nodes, flat, target = self.scene.nodes, self.flat, self.data.geometry
         world = animation.world_matrices(nodes, time)
         previous_world = animation.world_matrices(nodes, previous_time)
+        was, was_before = self.world, self.previous_world
+        self.world = self.previous_world = [None] * len(nodes)  # unknown, should an exception or a fork come between
         moved = changed = False
         for index, node in enumerate(nodes):
             start, stop = flat.vertex_starts[index : index + 2]
             if start == stop or not self.scene._moving[index]:
                 continue
-            if not np.array_equal(previous_world[index], self.previous_world[index]):
+            if not np.array_equal(previous_world[index], was_before[index]):
                 vertex = start
                 for mesh in node.meshes:
                     end = vertex + len(mesh.points)
@@ -369,7 +387,7 @@ class _DeviceScene:
                     vertex = end
                 self._upload(target.previous_points, self.previous_points, start, stop)
                 changed = True
-            if not np.array_equal(world[index], self.world[index]):
+            if not np.array_equal(world[index], was[index]):
                 geometry.place(flat, node, world[index], start)
                 self._upload(target.points, flat.points, start, stop)
                 self._upload(target.normals, flat.normals, start, stop)
@@ -379,10 +397,10 @@ class _DeviceScene:
             changed |= not np.array_equal(table, self.emitters)
             self.emitters[:] = table
             self._upload(self.data.emitters.emitters, self.emitters, len(self.scene._emissive), len(self.emitters))
-        self.world, self.previous_world = world, previous_world
         if moved:
             self.bvh.refit(flat.points)
             self._bound_emitters(self.data.emitters)
+        self.world, self.previous_world = world, previous_world
         return moved or changed
 
     def _bound_emitters(self, target: types.Emitters) -> None:
