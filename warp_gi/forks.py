@@ -1,4 +1,4 @@
-"""What else a forked process needs: free locks, and an EXR writer without the parent's threads."""
+"""What else a forked process needs: free locks, an EXR writer without threads, and to know that CUDA is lost."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import weakref
 from typing import Any
 
 _guards: weakref.WeakSet[Guard] = weakref.WeakSet()
-is_forked = False
-"""Whether this process was forked by one that had imported this module."""
+has_lost_cuda = False
+"""Whether this process was forked after CUDA had started, from when on CUDA fails here."""
 
 
 class Guard:
@@ -29,8 +29,10 @@ class Guard:
 
 
 def _after_fork() -> None:
-    global is_forked
-    is_forked = True
+    global has_lost_cuda
+    context = sys.modules.get("warp._src.context")
+    if getattr(context, "runtime", None) is not None:  # asked without a call, which would start Warp
+        has_lost_cuda = context.is_cuda_available()
     for guard in list(_guards):
         guard.lock = threading.RLock()
     if "OpenImageIO" in sys.modules:  # writing EXR waits for ever for threads that only the parent has

@@ -89,7 +89,7 @@ def get_device(name: str | None) -> wp.Device:
 
 def check_fork(device: wp.Device) -> None:
     """Raise OptionError for a CUDA device in a process that was forked after CUDA had started: it cannot work there."""
-    if forks.is_forked and device.is_cuda and not wp.is_cuda_driver_initialized():
+    if forks.has_lost_cuda and device.is_cuda:
         raise OptionError(
             f"device {device.alias!r} cannot be used here: this process was forked after CUDA had started; start "
             "processes by the method 'spawn' or 'forkserver' of multiprocessing, or use the device 'cpu'"
@@ -136,8 +136,8 @@ def launch(
     type, dtype, rank or device is not what the kernel declares, OptionError for CUDA in
     a process forked after CUDA had started. After an interrupt nothing of the launch goes on.
     """
-    _check(kernel, inputs, device)
     check_fork(device)
+    _check(kernel, inputs, device)
     if count <= 0:
         return
     load(kernel, device)
