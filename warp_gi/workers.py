@@ -110,8 +110,8 @@ def share(run: Callable[[int], None], count: int, threads: int) -> None:
         finally:
             slices.settle()
     finally:
-        slices.settle()  # a second interrupt may have kept the first from its work
         _open.discard(slices)
+        slices.settle()  # a second interrupt may have ended the wait above
     if slices.is_lost:
         raise RuntimeError("this process was forked in the middle of a launch; its arrays are incomplete, launch again")
     if slices.error is not None:
