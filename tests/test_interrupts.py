@@ -6,6 +6,7 @@ import _thread
 import gc
 import signal
 import sys
+import tempfile
 import threading
 import time
 
@@ -69,7 +70,8 @@ class InterruptAt:
 
 
 def interrupt_a_launch_everywhere():
-    """At every place in the launcher, with workers there already and with none."""
+    """At every place in the launcher and what it calls, with workers there already and with none."""
+    files = ("launch.py", "workers.py", "context.py", "thread.py", "threading.py", "_base.py")
     assert_launches_work()
     for fresh in (False, True):
         place, interrupts = 0, 0
@@ -78,7 +80,7 @@ def interrupt_a_launch_everywhere():
                 workers._forget_workers()  # those of before wait for ever for work that never comes
             out = wp.zeros(COUNT, dtype=wp.int32, device="cpu")
             try:
-                with InterruptAt(place, "launch.py", "workers.py") as interrupt:
+                with InterruptAt(place, *files) as interrupt:
                     launch_once(out)
             except KeyboardInterrupt:
                 interrupts += 1
@@ -92,6 +94,35 @@ def interrupt_a_launch_everywhere():
             place += 1
         assert (out.numpy() == 1).all()
         assert interrupts == place > 50, (interrupts, place)
+
+
+def interrupt_the_compiler():
+    """At places all over the compilation of a kernel: it compiles the next time, and so do others."""
+
+    def make_kernel(factor):
+        @wp.kernel(enable_backward=False, module="unique")
+        def multiply(first: wp.int32, out: wp.array(dtype=wp.int32)):
+            i = first + wp.tid()
+            out[i] = out[i] + i * wp.static(factor)
+
+        return multiply
+
+    files = ("launch.py", "context.py", "build.py", "codegen.py", "tempfile.py", "shutil.py")
+    out, cpu = wp.zeros(COUNT, dtype=wp.int32, device="cpu"), launch.get_device("cpu")
+    with tempfile.TemporaryDirectory() as folder:
+        wp.config.kernel_cache_dir = folder
+        launch.launch(make_kernel(1), COUNT, [out], cpu)  # makes what all compilations share
+        kernel = make_kernel(2)
+        with InterruptAt(10**9, *files) as counted:
+            launch.launch(kernel, COUNT, [out], cpu)
+        places = 10**9 - counted.left
+        for factor in range(3, 15):
+            kernel = make_kernel(factor)
+            with InterruptAt(int(places * (factor - 2.5) / 13), *files), pytest.raises(KeyboardInterrupt):
+                launch.launch(kernel, COUNT, [out], cpu)
+            out.zero_()
+            launch.launch(kernel, COUNT, [out], cpu)
+            assert (out.numpy() == factor * np.arange(COUNT)).all(), factor
 
 
 def interrupt_the_wait():
@@ -214,6 +245,7 @@ def leave_generators():
 
 CASES = (
     interrupt_a_launch_everywhere,
+    interrupt_the_compiler,
     interrupt_the_wait,
     interrupt_the_slices,
     interrupt_frames_at_many_times,
