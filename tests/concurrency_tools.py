@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,11 +18,13 @@ from warp_gi.scene.model import Keyframe
 
 FPS = 8
 SIZE = (40, 30)
+FIELD = gi.VisibilityField(cell_size=0.5, samples=400, rays=16)
 
 
 def moving_room(seconds: float = 2.0) -> gi.Scene:
-    """Return a Cornell box whose tall block turns and flies, and whose lamp sinks."""
+    """Return a Cornell box under a sky whose tall block turns and flies, and whose lamp sinks."""
     scene = gi.builtin_scene("cornell_box")
+    scene.environment = (0.4, 0.5, 0.7)
     scene.animate("tall block", [Keyframe(0.0), Keyframe(seconds, (0.3, 0.5, 0.4), (0.0, 0.6, 0.0, 0.8))])
     scene.animate("lamp", [Keyframe(0.0), Keyframe(seconds, (0.0, -0.4, 0.0))])
     return scene
@@ -33,9 +36,15 @@ def still_path(scene: gi.Scene) -> gi.CameraPath:
     return gi.CameraPath(gi.CameraPath.still(camera).keys, fps=FPS, resolution=SIZE)
 
 
+def pipeline(preset: str = "path") -> gi.Pipeline:
+    """Return a preset with two samples a pixel, and a visibility field that is baked soon."""
+    made = gi.Pipeline.preset(preset, spp=2)
+    return replace(made, environment=FIELD) if preset == "dvf" else made
+
+
 def scheduler(scene: gi.Scene, preset: str = "path", seed: int = 1, **options: object) -> gi.FrameScheduler:
-    """Return what renders the scene from its camera, two samples a pixel."""
-    return gi.FrameScheduler(scene, still_path(scene), gi.Pipeline.preset(preset, spp=2), seed=seed, **options)
+    """Return what renders the scene from its camera."""
+    return gi.FrameScheduler(scene, still_path(scene), pipeline(preset), seed=seed, **options)
 
 
 def buffers(frame: gi.Frame) -> dict[str, np.ndarray]:
