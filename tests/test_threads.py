@@ -107,22 +107,22 @@ def edits_beside_frames():
 
 
 def other_thread_counts_beside_launches():
-    """``set_threads`` may be called while other threads launch."""
-    scene, ends = moving_room(), threading.Event()
-    wanted = frames(scene, range(8))
+    """``set_threads`` may be called while several threads launch."""
+    wanted, left = frames(moving_room(), range(8)), [2]
 
     def change():
-        while not ends.is_set():
+        while left[0]:
             for count in (2, 3, 5, 4):
                 launch.set_threads(count)
 
     def render():
         try:
-            return [frames(moving_room(), range(8)) for _ in range(3)]
+            scene = moving_room()
+            return [frames(scene, range(8)) for _ in range(2)]
         finally:
-            ends.set()
+            left[0] -= 1
 
-    for found in together(render, change)[0]:
+    for found in itertools.chain(*together(render, render, change)[:2]):
         assert differing(found, wanted) == []
 
 
