@@ -16,6 +16,7 @@ import itertools
 import os
 import threading
 import time
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -38,6 +39,8 @@ compile_cpu_seconds = 0.0
 on_load: Callable[[str], None] | None = None
 """Called with a kernel module's name before its first launch, which may take seconds to compile; for progress."""
 _loaded: set[tuple[str, str]] = set()
+_bound: weakref.WeakKeyDictionary[wp.Kernel, set[str]] = weakref.WeakKeyDictionary()
+"""Devices on which Warp has looked up a kernel's machine code."""
 
 
 def thread_count() -> int:
@@ -141,6 +144,10 @@ def launch(
     if count <= 0:
         return
     load(kernel, device)
+    if device.alias not in _bound.get(kernel, ()):
+        with _loading:  # the linker has locks, as the compiler
+            wp.launch(kernel, dim=1, inputs=[0, *inputs], device=device, record_tape=False, record_cmd=True)
+        _bound.setdefault(kernel, set()).add(device.alias)
     if device.is_cuda:
         wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device, record_tape=False)
         return

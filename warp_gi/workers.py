@@ -88,7 +88,7 @@ def _nothing(index: int) -> None:
 
 _offers: SimpleQueue[Slices] = SimpleQueue()
 _hired = 0
-_hiring = threading.Lock()
+_hiring = threading.RLock()  # a signal's handler may launch, too
 _open: set[Slices] = set()
 
 
@@ -139,7 +139,7 @@ def _serve(offers: SimpleQueue[Slices]) -> None:
 def _forget_workers() -> None:
     """Start afresh in a process just forked, which has none of its parent's threads."""
     global _offers, _hired, _hiring
-    _offers, _hired, _hiring = SimpleQueue(), 0, threading.Lock()
+    _offers, _hired, _hiring = SimpleQueue(), 0, threading.RLock()
     for slices in list(_open):
         slices.renew()
 
