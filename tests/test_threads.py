@@ -25,6 +25,7 @@ from concurrency_tools import (
 
 import warp_gi as gi
 from warp_gi import launch, workers
+from warp_gi.techniques.reuse_pictures import reuse_pictures
 
 
 def together(*works):
@@ -163,6 +164,16 @@ def test_a_bake_does_not_depend_on_who_moved_the_scene():
     assert scheduler(scene, "dvf").state("environment").to_bake().digest == (
         scheduler(moving_room(), "dvf").state("environment").to_bake().digest
     )
+
+
+def test_pictures_of_reuse_are_of_their_frame(tmp_path):
+    """Wherever others have moved the scene since."""
+    scene = moving_room()
+    renderer = scheduler(scene, "reuse")
+    frame = [renderer.frame(index) for index in range(FPS)][-1]
+    first = [path.read_bytes() for path in reuse_pictures(renderer, frame, tmp_path)]
+    scene.update(0.0, 0.0, "cpu")
+    assert [path.read_bytes() for path in reuse_pictures(renderer, frame, tmp_path)] == first
 
 
 def test_an_exception_frees_the_scene():
