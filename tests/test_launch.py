@@ -1,5 +1,6 @@
 """The launcher: slices, threads, and the checks that Warp does not make."""
 
+import threading
 import time
 from types import SimpleNamespace
 
@@ -103,3 +104,41 @@ def test_loading_is_timed_on_the_wall_and_the_cores(monkeypatch):
     module = SimpleNamespace(name="slow", load=lambda device, block: (time.sleep(0.2), sum(range(10**6))))
     launch.load(SimpleNamespace(module=module), CPU)
     assert launch.compile_seconds > launch.compile_cpu_seconds + 0.1 and launch.compile_cpu_seconds > 0
+
+
+def test_a_module_is_announced_until_it_is_loaded(monkeypatch):
+    told = []
+
+    def fail_once(name):
+        told.append(name)
+        if len(told) == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(launch, "on_load", fail_once)
+    kernel = SimpleNamespace(module=SimpleNamespace(name="announced", load=lambda device, block: None))
+    with pytest.raises(KeyboardInterrupt):
+        launch.load(kernel, CPU)
+    for _ in range(2):
+        launch.load(kernel, CPU)
+    assert told == ["announced"] * 2
+
+
+def test_the_linker_is_called_under_the_lock_that_a_fork_takes(monkeypatch):
+    """A fork while another thread is inside would leave a child that waits for ever when it links."""
+    library = wp._src.context.runtime.llvm
+    look_up, was_free = library.wp_lookup, []
+
+    def spy(*arguments):
+        thread = threading.Thread(target=lambda: was_free.append(launch._loading.acquire(blocking=False)))
+        thread.start()
+        thread.join()
+        return look_up(*arguments)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def count(first: wp.int32, out: wp.array(dtype=wp.int32)):
+        out[first + wp.tid()] = first + wp.tid()
+
+    monkeypatch.setattr(library, "wp_lookup", spy)
+    out = wp.zeros(5000, dtype=wp.int32, device=CPU)
+    launch.launch(count, 5000, [out], CPU)
+    assert was_free == [False] and (out.numpy() == np.arange(5000)).all()

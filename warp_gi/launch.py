@@ -1,33 +1,36 @@
 """The only caller of ``wp.launch``: checks arguments, slices CPU launches over threads, times compiles.
 
 Every kernel takes ``first: wp.int32`` as its first argument and owns the item
-``first + wp.tid()``. On the CPU a launch becomes slices that a pool of threads
-works off (a Warp CPU launch is one thread and releases the GIL); on CUDA it is
+``first + wp.tid()``. On the CPU a launch becomes slices that ``workers`` share
+(a Warp CPU launch is one thread and releases the GIL); on CUDA it is
 one launch with ``first = 0``. No kernel uses atomics on the CPU, so the result
 does not depend on the slices.
+
+In a forked process launches on the CPU work, of kernels that the parent has loaded
+and of others. CUDA does not work there once the parent has started it: an error says so.
 """
 
 from __future__ import annotations
 
+import itertools
 import os
 import threading
 import time
+import weakref
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from warp_gi import forks, workers
 from warp_gi.errors import OptionError
 
 SLICES_PER_THREAD = 16  # enough to balance uneven work, few enough that 30 us a launch vanish
 SMALLEST_SLICE = 256  # items
 CUDA_BLOCK = 256  # threads
 
-_pool: ThreadPoolExecutor | None = None
-_pool_size = 0
-_lock = threading.Lock()
+_loading = threading.RLock()  # taken across a fork, so that no thread that only the parent has is inside the compiler
 _threads: int | None = None
 compile_seconds = 0.0
 """Wall seconds this process has spent compiling or loading kernel modules."""
@@ -36,6 +39,8 @@ compile_cpu_seconds = 0.0
 on_load: Callable[[str], None] | None = None
 """Called with a kernel module's name before its first launch, which may take seconds to compile; for progress."""
 _loaded: set[tuple[str, str]] = set()
+_bound: weakref.WeakKeyDictionary[wp.Kernel, set[str]] = weakref.WeakKeyDictionary()
+"""Devices on which Warp has looked up a kernel's machine code."""
 
 
 def thread_count() -> int:
@@ -70,14 +75,28 @@ def _checked_threads(value: object) -> int:
 
 
 def get_device(name: str | None) -> wp.Device:
-    """Return the Warp device of that name ("cpu", "cuda", "cuda:1"); raises OptionError if it is not there."""
+    """Return the Warp device of that name ("cpu", "cuda", "cuda:1").
+
+    Raises OptionError if it is not there, or is CUDA in a process forked after CUDA had started.
+    """
     try:
         if name and name.startswith("cuda") and not wp.is_cuda_available():  # Warp would print before it raises
             raise RuntimeError("Warp finds no CUDA driver or GPU")
-        return wp.get_device(name or "cpu")
+        device = wp.get_device(name or "cpu")
     except (RuntimeError, ValueError) as error:
         known = ", ".join(device.alias for device in wp.get_devices())
         raise OptionError(f"device {name!r} is not available ({error}); use one of: {known}") from error
+    check_fork(device)
+    return device
+
+
+def check_fork(device: wp.Device) -> None:
+    """Raise OptionError for a CUDA device in a process that was forked after CUDA had started: it cannot work there."""
+    if forks.has_lost_cuda and device.is_cuda:
+        raise OptionError(
+            f"device {device.alias!r} cannot be used here: this process was forked after CUDA had started; start "
+            "processes by the method 'spawn' or 'forkserver' of multiprocessing, or use the device 'cpu'"
+        )
 
 
 def on_device(values: np.ndarray, dtype: Any, device: wp.Device) -> wp.array:
@@ -101,12 +120,12 @@ def load(kernel: wp.Kernel, device: wp.Device) -> None:
     """Compile or load the kernel's module now; add its time to ``compile_seconds`` and ``compile_cpu_seconds``."""
     global compile_seconds, compile_cpu_seconds
     started, cpu = time.perf_counter(), time.process_time()
-    if (kernel.module.name, device.alias) not in _loaded:
-        _loaded.add((kernel.module.name, device.alias))
-        if on_load is not None:
+    module = (kernel.module.name, device.alias)
+    with _loading:
+        if module not in _loaded and on_load is not None:
             on_load(kernel.module.name)
-    with _lock:
         kernel.module.load(device, 1 if device.is_cpu else CUDA_BLOCK)
+        _loaded.add(module)
     compile_seconds += time.perf_counter() - started
     compile_cpu_seconds += time.process_time() - cpu
 
@@ -117,36 +136,33 @@ def launch(
     """Run ``kernel`` over items 0 to ``count`` - 1.
 
     ``inputs`` are the arguments after ``first``. Raises TypeError when an argument's
-    type, dtype, rank or device is not what the kernel declares.
+    type, dtype, rank or device is not what the kernel declares, OptionError for CUDA in
+    a process forked after CUDA had started. After an interrupt nothing of the launch goes on.
     """
+    check_fork(device)
     _check(kernel, inputs, device)
     if count <= 0:
         return
     load(kernel, device)
+    if device.alias not in _bound.get(kernel, ()):
+        with _loading:  # the linker has locks, as the compiler
+            wp.launch(kernel, dim=1, inputs=[0, *inputs], device=device, record_tape=False, record_cmd=True)
+        _bound.setdefault(kernel, set()).add(device.alias)
     if device.is_cuda:
         wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device, record_tape=False)
         return
     threads = thread_count()
     slice_count = min(threads * SLICES_PER_THREAD if threads > 1 else 1, -(-count // smallest_slice))
-    bounds = [count * i // slice_count for i in range(slice_count + 1)]
+    bounds = list(itertools.pairwise(count * i // slice_count for i in range(slice_count + 1)))
 
-    def run(begin: int, end: int) -> None:
+    def run(index: int) -> None:
+        begin, end = bounds[index]
         wp.launch(kernel, dim=end - begin, inputs=[begin, *inputs], device=device, record_tape=False)
 
     if slice_count == 1:
-        run(0, count)
-        return
-    list(_thread_pool(threads).map(run, bounds[:-1], bounds[1:]))
-
-
-def _thread_pool(size: int) -> ThreadPoolExecutor:
-    global _pool, _pool_size
-    with _lock:
-        if _pool is None or _pool_size != size:
-            if _pool is not None:
-                _pool.shutdown(wait=True)
-            _pool, _pool_size = ThreadPoolExecutor(size, thread_name_prefix="warp_gi"), size
-        return _pool
+        run(0)
+    else:
+        workers.share(run, slice_count, threads)
 
 
 def _check(kernel: wp.Kernel, inputs: Sequence[object], device: wp.Device) -> None:
@@ -188,3 +204,14 @@ def _mismatch(expected: object, value: object, device: wp.Device) -> str | None:
     if isinstance(value, np.ndarray | wp.array):
         return f"expected {expected}, got an array"
     return None
+
+
+def _unlock_loading() -> None:
+    global _loading
+    _loading = threading.RLock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(
+        before=lambda: _loading.acquire(), after_in_parent=lambda: _loading.release(), after_in_child=_unlock_loading
+    )

@@ -7,9 +7,10 @@ import time
 from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import wraps
 from numbers import Integral
 from pathlib import Path
-from typing import Any
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 import warp as wp
@@ -217,6 +218,23 @@ class Frame:
         return filled
 
 
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
+
+
+def _holds_scene(
+    method: Callable[Concatenate[FrameScheduler, _Arguments], _Result],
+) -> Callable[Concatenate[FrameScheduler, _Arguments], _Result]:
+    """Return a method during which no other thread moves, edits or renders the scene."""
+
+    @wraps(method)
+    def holding(self: FrameScheduler, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        with self.scene.lock:
+            return method(self, *args, **kwargs)
+
+    return holding
+
+
 class FrameScheduler:
     """Renders frames of a scene along a camera path: bake once, then preprocess and trace each frame.
 
@@ -228,6 +246,9 @@ class FrameScheduler:
         seed: Every random number follows from it, the frame, the pixel and the sample.
         progress: Called with (stage, share done in [0, 1]) while baking and tracing.
         bakes: Bakes made before (``gi.bake``, ``gi.load_bake``), each for the estimator that it names.
+
+    Several may render one scene, in turns or on threads of their own: a frame has the scene to itself until it is
+    done. Each is for one thread at a time.
 
     Raises OptionError for a device that is not there, BakeError for a bake of another scene or other settings.
     """
@@ -277,6 +298,7 @@ class FrameScheduler:
         self._baked_version = -1
         self._scene_hash = ""
 
+    @_holds_scene
     def bake(self) -> None:
         """Let every estimator compute what it can before the first frame; done by the first frame otherwise.
 
@@ -286,6 +308,8 @@ class FrameScheduler:
         if self._baked_version == self.scene.version:
             return
         started = time.perf_counter()
+        launch.check_fork(self.device)
+        self.scene.update(0.0, None, self.device)  # bakes and first states do not depend on who moved the scene before
         self._states.pop("lights", None)
         for term, estimator in self._estimators.items():
             key = estimator.bake_key(self.scene)
@@ -324,6 +348,7 @@ class FrameScheduler:
             raise unknown_name("term of this pipeline", term, self._states)
         return self._states[term]
 
+    @_holds_scene
     def frame(self, index: int, previous_index: int | None = None) -> Frame:
         """Render frame ``index``; motion is towards frame ``previous_index`` (None: the frame before it, if any).
 
@@ -566,7 +591,9 @@ def bake(
     """
     scene.check_unchanged()
     told = (lambda share: progress("bake", share)) if progress else None
-    result = estimator.bake(scene, device, seed, told, camera_path)
+    with scene.lock:
+        scene.update(0.0, None, device)
+        result = estimator.bake(scene, device, seed, told, camera_path)
     if result is None:
         raise OptionError(
             f"{type(estimator).__name__} with these settings has nothing to bake; render with it as it is"

@@ -8,6 +8,7 @@ import numpy as np
 
 from warp_gi.baking import Bake
 from warp_gi.errors import BakeError
+from warp_gi.forks import Guard
 from warp_gi.kernels import types
 
 
@@ -29,11 +30,17 @@ class BakedScene:
             raise BakeError(
                 f"a bake of {bake.technique} cannot be rendered without its scene; a bake of LightFieldProbes can"
             )
+        self._guard = Guard()
         self.bake = bake
         self.name = bake.scene_name
         self.contents_hash = bake.scene_key
         self.hash = bake.digest
         self.cameras: dict[str, Any] = {}
+
+    @property
+    def lock(self) -> Any:
+        """A re-entrant lock, as that of a ``Scene``."""
+        return self._guard.lock
 
     @property
     def bounds(self) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from warp_gi.errors import SceneError, unknown_name
+from warp_gi.forks import Guard
 from warp_gi.kernels import types
 from warp_gi.launch import get_device, on_device
 from warp_gi.scene import animation, emitters, geometry, textures
@@ -52,6 +53,7 @@ class Scene:
         name: str = "scene",
         camera_nodes: Mapping[str, int] | None = None,
     ) -> None:
+        self._guard = Guard()
         self.name = name
         self.version = 0
         """Counts up when the environment or the animation is replaced: what was derived from the scene is stale."""
@@ -85,6 +87,14 @@ class Scene:
     # ---- what is in it ----
 
     @property
+    def lock(self) -> Any:
+        """A re-entrant lock: whoever holds it, as each frame and bake does, is the only one to move or edit the scene.
+
+        Take it around ``update`` and what is read after it, where other threads render.
+        """
+        return self._guard.lock
+
+    @property
     def environment(self) -> Environment | None:
         """The sky; set it to a path, an RGB radiance, an Environment, a SunSky or None. The geometry stays built."""
         return self._environment
@@ -95,12 +105,13 @@ class Scene:
             from warp_gi.scene.environment import as_environment
 
             value = as_environment(value)
-        self._environment = value
-        self.version += 1
-        for device_scene in self._devices.values():
-            device_scene.set_environment(value)
-        if self._devices:
-            self._edits.sky_in_use()
+        with self.lock:
+            self._environment = value
+            self.version += 1
+            for device_scene in self._devices.values():
+                device_scene.set_environment(value)
+            if self._devices:
+                self._edits.sky_in_use()
 
     @property
     def triangle_count(self) -> int:
@@ -225,8 +236,9 @@ class Scene:
             raise SceneError(f"{len(matches)} nodes are named {node!r}; give the one to animate a name of its own")
         animation.check_keyframes(keyframes, node)
         geometry.check_nodes(self.nodes)  # they are read anew, with every edit so far
-        self.nodes[matches[0]].keyframes = list(keyframes)
-        self._flatten()
+        with self.lock:
+            self.nodes[matches[0]].keyframes = list(keyframes)
+            self._flatten()
 
     def moves(self, index: int) -> bool:
         """Return whether node ``index``, or one above it, has keyframes."""
@@ -259,8 +271,9 @@ class Scene:
         """
         if not self.is_animated:
             return False
-        self.data(device)
-        return self._devices[_device(device).alias].move(time, time if previous_time is None else previous_time)
+        with self.lock:
+            self.data(device)
+            return self._devices[_device(device).alias].move(time, time if previous_time is None else previous_time)
 
     # ---- what kernels read ----
 
@@ -270,12 +283,13 @@ class Scene:
         The alias tables of the emitters are empty: each light sampler fills its own.
         """
         device = _device(device)
-        if device.alias not in self._devices:
-            self._edits.check()
-            self._devices[device.alias] = _DeviceScene(self, device)
-            if len(self._devices) == 1:
-                self._edits.in_use()
-        return self._devices[device.alias].data
+        with self.lock:
+            if device.alias not in self._devices:
+                self._edits.check()
+                self._devices[device.alias] = _DeviceScene(self, device)
+                if len(self._devices) == 1:
+                    self._edits.in_use()
+            return self._devices[device.alias].data
 
     def check_unchanged(self) -> None:
         """Raise SceneError if something was edited that pictures would not show: one line that says what, and the cure.
@@ -291,8 +305,9 @@ class Scene:
 
     def resting_bvh(self, device: str | wp.Device | None = None) -> Any:
         """Return a TriangleBvh of what never moves; ``bvh`` itself if nothing does."""
-        self.data(device)
-        return self._devices[_device(device).alias].resting_bvh()
+        with self.lock:
+            self.data(device)
+            return self._devices[_device(device).alias].resting_bvh()
 
     def _all_bounds(self) -> np.ndarray:
         flat = self._flat
@@ -381,15 +396,15 @@ class _DeviceScene:
         nodes, flat, target = self.scene.nodes, self.flat, self.data.geometry
         world = animation.world_matrices(nodes, time)
         previous_world = animation.world_matrices(nodes, previous_time)
-        before, before_previous = self.world, self.previous_world
-        # until all is moved no pose is known: the next call after an interrupt places everything
+        was, was_before = self.world, self.previous_world
+        # until all is moved no pose is known: the next call after an interrupt or a fork places everything
         self.world = self.previous_world = [np.full((4, 4), np.nan)] * len(nodes)
         moved = changed = False
         for index, node in enumerate(nodes):
             start, stop = flat.vertex_starts[index : index + 2]
             if start == stop or not self.scene._moving[index]:
                 continue
-            if not np.array_equal(previous_world[index], before_previous[index]):
+            if not np.array_equal(previous_world[index], was_before[index]):
                 vertex = start
                 for mesh in node.meshes:
                     end = vertex + len(mesh.points)
@@ -397,7 +412,7 @@ class _DeviceScene:
                     vertex = end
                 self._upload(target.previous_points, self.previous_points, start, stop)
                 changed = True
-            if not np.array_equal(world[index], before[index]):
+            if not np.array_equal(world[index], was[index]):
                 geometry.place(flat, node, world[index], start)
                 self._upload(target.points, flat.points, start, stop)
                 self._upload(target.normals, flat.normals, start, stop)

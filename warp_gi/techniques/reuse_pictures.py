@@ -59,7 +59,14 @@ def reuse_pictures(
 
     Raises OptionError for a pipeline that learns nothing, a pixel outside of the picture or without a surface.
     """
-    check_pictures(scheduler, frame.camera, pixel)
+    with scheduler.scene.lock:
+        check_pictures(scheduler, frame.camera, pixel)
+        scheduler.scene.update(frame.time, None, scheduler.device)  # others may have moved it since the frame
+        return write_pngs(folder, _pictures(scheduler, frame, pixel))
+
+
+def _pictures(scheduler: FrameScheduler, frame: Frame, pixel: tuple[int, int] | None) -> dict[str, np.ndarray]:
+    """Return the pictures by name, uint8 [height, width, 3]."""
     width, height = frame.camera.resolution
     state = scheduler.state("octree")
     view = _view(frame.data, frame.camera, state.octree, frame.device)
@@ -82,7 +89,7 @@ def reuse_pictures(
         pictures["bsdf_share"] = _draw_values(leaves, shares, 1.0, title)
     if pixel is not None:
         pictures["quadtree"] = _draw_quadtree(scheduler, frame, view, pixel)
-    return write_pngs(folder, pictures)
+    return pictures
 
 
 def check_pictures(scheduler: FrameScheduler, camera: Camera, pixel: tuple[int, int] | None = None) -> None:
