@@ -267,6 +267,18 @@ def ray_light(
     return lobes_of(s, wo, sample, light, query.mode)
 
 
+# Rays of a pixel in the current camera sample, the first of them, and the bits that count those of the pixel.
+@wp.func
+def ray_numbers(query: ProbeQuery, s: Surface, by_path: wp.bool) -> wp.vec3i:
+    if query.mode == MODE_IRRADIANCE:
+        if by_path:
+            return wp.vec3i(query.samples, query.first_sample, query.sample_bits)
+        return wp.vec3i(0, query.first_ray, query.ray_bits)
+    if query.mode == MODE_HYBRID and s.bsdf.f90 <= 0.0 and not by_path:
+        return wp.vec3i(0, query.first_ray, query.ray_bits)
+    return wp.vec3i(query.rays, query.first_ray, query.ray_bits)
+
+
 # Thread: a pixel.
 @wp.kernel
 def trace_probes(
@@ -298,20 +310,13 @@ def trace_probes(
         seen = seen_light(scene, field, query.visibility, s.position, shading_normal(s), ray_origin(s))
     by_path = seen.probes == 0
     steady = steady_light(seen.irradiance, s, query.mode)
-    rays = int(0)
-    first_ray = query.first_ray
-    ray_bits = query.ray_bits
-    if by_path and query.mode == MODE_IRRADIANCE:
-        rays = query.samples
-        first_ray = query.first_sample
-        ray_bits = query.sample_bits
-    elif by_path or query.mode == MODE_TRACED or (query.mode == MODE_HYBRID and s.bsdf.f90 > 0.0):
-        rays = query.rays
+    numbers = ray_numbers(query, s, by_path)
+    rays = numbers[0]
     share = wp.float32(settings.sample_count)  # samples that one evaluation stands for
     if rays > 0:
         share = share / wp.float32(rays)
-    seed = pixel_seed(p[0], p[1], ray_bits, settings.seed)
-    first_index = pixel_sample_index(p[0], p[1], first_ray, ray_bits)
+    seed = pixel_seed(p[0], p[1], numbers[2], settings.seed)
+    first_index = pixel_sample_index(p[0], p[1], numbers[1], numbers[2])
     diffuse = wp.vec3(0.0, 0.0, 0.0)
     glossy = wp.vec3(0.0, 0.0, 0.0)
     moment2 = wp.vec3(0.0, 0.0, 0.0)

@@ -276,6 +276,7 @@ def test_states_load_into_a_run_that_went_on(wholes):
     assert_same(run.frame(1), frames[1], "frame 1")
     assert len(states[-1][1]["environment.cells"]) > len(states[0][1]["environment.cells"]) > 0  # it grew
     other = Run(CASES[name], gi.FrameScheduler(yard(False), CASES[name].path(), CASES[name].pipeline, seed=3))
+    other.scheduler.bake()
     other.scheduler._bake_digests = run.scheduler._bake_digests
     with pytest.raises(BakeError, match="began with other cells"):
         other.scheduler.load_state(states[0][0], "past")

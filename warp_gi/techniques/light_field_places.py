@@ -25,7 +25,7 @@ from warp_gi.techniques.baselines import sky_probability
 
 AUTOMATIC_PROBES = 440
 """Most that there are where neither counts nor spacing are given."""
-ROOM_PROBES, UNSEEN_PROBES = 80, 128
+ROOM_PROBES, UNSEEN_PROBES = 100, 128
 """The same in rooms, where more of them come out darker (`bench/NOTES.md`), and where no camera says what is seen."""
 ROOM_SHARE = 0.06
 """A camera is in a room if fewer of the ways from what it sees, and on from there, lead out of the scene."""

@@ -59,7 +59,7 @@ class LightFieldProbes(Estimator):
     """Probes along x, y and z of the box that paths from the camera reach; 0 follows from the spacing."""
     spacing: float = 0.0
     """Metres between probes; 0 is a twelfth of the longest side, or as much more as it takes for at most 440 probes, in
-    rooms 80, and 128 if no camera is known."""
+    rooms 100, and 128 if no camera is known."""
     resolution: int = 0
     """Texels along a side of a probe's map, a multiple of 16; 0 is 128 for up to 128 probes, 64 for more."""
     irradiance_resolution: int = 32
@@ -175,7 +175,7 @@ class LightFieldProbes(Estimator):
         if not known.any(axis=1).all():
             warnings.warn(
                 f"this bake of probes is {'of another camera path' if len(made_for) else 'of no camera'}: "
-                "where too few of its probes see a surface, paths are traced, with noise: bake with this camera instead",
+                "where too few of its probes see a surface, paths are traced, with noise: bake for this camera",
                 stacklevel=2,
             )
 
