@@ -10,10 +10,18 @@ saw it: a light that is seen rarely stays for some frames, which the paper leave
 import warp as wp
 
 from warp_gi.kernels.bsdf import luminance
-from warp_gi.kernels.light_cache import MOST_BUCKETS, CacheTables, LightCache
+from warp_gi.kernels.light_cache import MOST_BUCKETS, PROBED, CacheTables, LightCache, choice_weight
 from warp_gi.kernels.octree import NEIGHBOURS, Octree, OctreeNodes, leaf_cell
 from warp_gi.kernels.quadtree_adapt import LARGEST_CONTRIBUTION
-from warp_gi.kernels.samples import LIGHT_BLOCKED, LIGHT_EXPLORED, LIGHT_ITEM, LIGHT_VISIBLE, LeafSamples, SampleRecords
+from warp_gi.kernels.samples import (
+    LIGHT_ALONE,
+    LIGHT_BLOCKED,
+    LIGHT_EXPLORED,
+    LIGHT_ITEM,
+    LIGHT_VISIBLE,
+    LeafSamples,
+    SampleRecords,
+)
 from warp_gi.kernels.sampling import spread_place
 from warp_gi.kernels.types import EMITTER_DIRECTIONAL, EMITTER_TRIANGLE
 
@@ -42,6 +50,7 @@ class CacheSettings:
     first_exploration: wp.float32  # share of samples, of regions that nothing is known of
     least_exploration: wp.float32
     most_exploration: wp.float32
+    may_be_alone: wp.int32  # 1: regions learn where exploring alone is better
 
 
 # Ascending order, by Shell's method.
@@ -211,8 +220,60 @@ def exploration_share(moments: wp.vec2, settings: CacheSettings) -> wp.float32:
     return wp.clamp(share, settings.least_exploration, settings.most_exploration)
 
 
+# Sums over light samples of squared luminances, of a region.
+@wp.struct
+class LightMoments:
+    offered: wp.float32  # of those by the cache
+    explored: wp.float32  # of those by exploring, of lights that the cache does not offer
+    excess: wp.float32  # by how much both choices together exceed exploring alone
+    # of samples by exploring alone, that know what the cache would do
+    alone: wp.float32  # their second moment
+    both: wp.float32  # that of both choices together
+    by_cache: wp.float32  # luminance that comes by the cache, and
+    by_exploring: wp.float32
+
+
+# What a sample tells of the region.
+@wp.func
+def add_sample(m: LightMoments, word: wp.uint32, value: wp.float32, rival: wp.float32, share: wp.float32) -> LightMoments:
+    r = m
+    square = float(0.0)
+    if value < LARGEST_CONTRIBUTION:
+        square = value * value
+    if (word & LIGHT_ALONE) == wp.uint32(0):
+        if (word & LIGHT_EXPLORED) != wp.uint32(0):
+            r.explored += square
+        elif (word & LIGHT_VISIBLE) != wp.uint32(0):
+            r.offered += square
+        if wp.abs(rival) < LARGEST_CONTRIBUTION * LARGEST_CONTRIBUTION:
+            r.excess += rival
+    elif rival >= 0.0 and square > 0.0:
+        # of the light the cache would bring this part, as often as `rival`, and exploring the rest
+        by_cache = choice_weight(rival, share) * rival / (rival + share)
+        offered = float(0.0)
+        if rival > 0.0:
+            offered = square * by_cache * by_cache / rival
+        explored = square * (1.0 - by_cache) * (1.0 - by_cache) / share
+        r.offered += offered / PROBED
+        if share > rival:
+            r.explored += explored / PROBED
+        r.alone += square / PROBED
+        r.both += (offered + explored) / PROBED
+        r.by_cache += value * by_cache
+        r.by_exploring += value * (1.0 - by_cache)
+    return r
+
+
+# By how much both choices exceed exploring alone. The means of the two choices are lost to their variance by twice
+# their product; where exploring is alone this is at most what its second moment and the two parts of the light allow.
+@wp.func
+def all_excess(m: LightMoments) -> wp.float32:
+    part = m.by_cache / wp.max(m.by_cache + m.by_exploring, SMALLEST_MOMENT)
+    return m.excess + m.both - m.alone * (1.0 - 2.0 * part * (1.0 - part))
+
+
 # Thread: a leaf. Counts how often each of its lights was tried by its samples, and how often seen; and learns how
-# much to explore.
+# much to explore, and whether to do so alone.
 @wp.kernel
 def weigh_light_samples(
     first: wp.int32,
@@ -228,33 +289,37 @@ def weigh_light_samples(
     origin = origins[leaf]
     moments = wp.vec2(0.0, 0.0)
     share = float(settings.first_exploration)
+    excess = float(0.0)
+    alone = settings.may_be_alone
     if origin >= 0:
         moments = known.moments[origin]
         share = known.exploration[origin]
+        excess = known.excesses[origin]
+        alone = known.alone[origin]
     count = samples.counts[leaf]
     looks = wp.min(count, samples.most)
-    offered = float(0.0)
-    explored = float(0.0)
+    m = LightMoments()
     for k in range(looks):
         slot = samples.order[samples.starts[leaf] + spread_place(k, looks, count)]
         word = records.lights[slot]
-        value = records.light_values[slot]
-        if (word & LIGHT_EXPLORED) != wp.uint32(0):
-            if value < LARGEST_CONTRIBUTION:
-                explored += value * value
-        elif (word & (LIGHT_VISIBLE | LIGHT_BLOCKED)) != wp.uint32(0):
+        m = add_sample(m, word, records.light_values[slot], records.rivals[slot], share)
+        was_tried = (word & (LIGHT_VISIBLE | LIGHT_BLOCKED)) != wp.uint32(0)
+        if was_tried and (word & LIGHT_EXPLORED) == wp.uint32(0):
             place = find_entry(joined, leaf, wp.int32(word & LIGHT_ITEM) - 1)
             seen = float(0.0)
             if (word & LIGHT_VISIBLE) != wp.uint32(0):
                 seen = 1.0
-                if value < LARGEST_CONTRIBUTION:
-                    offered += value * value
             if place >= 0:
                 joined.tries[place] = joined.tries[place] + wp.vec2(seen, 1.0)
     if origin >= 0 and count > 0:
         if known.buckets[origin] > 0:  # else all of the light came by exploring, which says nothing
-            moments = moments * FADING + wp.vec2(offered, explored * share)
+            moments = moments * FADING + wp.vec2(m.offered, m.explored * share)
             share = exploration_share(moments, settings)
+            excess = excess * FADING + all_excess(m)
+            if excess != 0.0 and settings.may_be_alone != 0:
+                alone = wp.where(excess > 0.0, 1, 0)
+    tables.excesses[leaf] = excess
+    tables.alone[leaf] = alone
     tables.moments[leaf] = moments
     tables.exploration[leaf] = wp.clamp(share, settings.least_exploration, settings.most_exploration)
     begin = joined.offsets[leaf]

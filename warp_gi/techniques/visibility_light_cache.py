@@ -96,7 +96,7 @@ class VisibilityLightCache(Estimator):
         places, areas = _places(scene.data(device))
         radiances = scene.emitter_powers() / (np.pi * np.maximum(areas, 1e-30)) * (areas > 0)
         luminances = launch.on_device(radiances.astype(np.float32), wp.float32, device)
-        return CacheState(_tables(8, device, self.exploration), _lists(8, device), places, tree, luminances)
+        return CacheState(_tables(8, device, self.exploration, self.adapts_exploration), _lists(8, device), places, tree, luminances)
 
     def preprocess(self, frame: Any, state: CacheState | None) -> CacheState | None:
         """Bring the shapes of lights and the table of exploration up to the frame, and give paths the cache."""
@@ -154,6 +154,7 @@ class VisibilityLightCache(Estimator):
         settings.first_exploration = self.exploration
         adapted = (LEAST_EXPLORATION, MOST_EXPLORATION) if self.adapts_exploration else (self.exploration,) * 2
         settings.least_exploration, settings.most_exploration = adapted
+        settings.may_be_alone = int(self.adapts_exploration)
         samples, origins = lesson.leaf_samples(self.samples), lesson.origins
 
         seen = _lists(leaves, device)
@@ -166,7 +167,7 @@ class VisibilityLightCache(Estimator):
         joined.entries = wp.zeros(size, dtype=wp.int32, device=device)
         joined.tries = wp.zeros(size, dtype=wp.vec2, device=device)
         lesson.launch(light_cache_build.join_lights, [*around, joined, self.memory])
-        tables, sizes = _tables(leaves, device, self.exploration), wp.empty(leaves, dtype=wp.int32, device=device)
+        tables, sizes = _tables(leaves, device, self.exploration, self.adapts_exploration), wp.empty(leaves, dtype=wp.int32, device=device)
         inputs = [settings, samples, lesson.records, joined, origins, state.tables, tables]
         lesson.launch(light_cache_build.weigh_light_samples, inputs)
 
@@ -206,7 +207,7 @@ class CacheState:
     """Emitter [emitter] of the scene; None before the first frame."""
 
 
-def _tables(leaves: int, device: wp.Device, exploration: float) -> light_cache.CacheTables:
+def _tables(leaves: int, device: wp.Device, exploration: float, alone: bool) -> light_cache.CacheTables:
     tables = light_cache.CacheTables()
     tables.buckets = wp.zeros(leaves, dtype=wp.int32, device=device)
     tables.offsets = wp.zeros(leaves, dtype=wp.int32, device=device)
@@ -214,7 +215,9 @@ def _tables(leaves: int, device: wp.Device, exploration: float) -> light_cache.C
     tables.rates = wp.zeros(0, dtype=wp.float32, device=device)
     tables.chances = wp.zeros(0, dtype=wp.float32, device=device)
     tables.exploration = wp.full(leaves, exploration, dtype=wp.float32, device=device)
+    tables.alone = wp.full(leaves, int(alone), dtype=wp.int32, device=device)
     tables.moments = wp.zeros(leaves, dtype=wp.vec2, device=device)
+    tables.excesses = wp.zeros(leaves, dtype=wp.float32, device=device)
     return tables
 
 
