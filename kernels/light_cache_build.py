@@ -228,9 +228,9 @@ class LightMoments:
     excess: wp.float32  # by how much both choices together exceed exploring alone
     # of samples by exploring alone, that know what the cache would do
     alone: wp.float32  # their second moment
-    both: wp.float32  # that of both choices together
-    by_cache: wp.float32  # luminance that comes by the cache, and
-    by_exploring: wp.float32
+    cached: wp.float32  # that of the cache's choice, and of the choice to explore beside it
+    beside: wp.float32
+    largest: wp.float32  # of a sample, what it adds to `excess` or to how much these two exceed `alone`
 
 
 # What a sample tells of the region.
@@ -247,6 +247,7 @@ def add_sample(m: LightMoments, word: wp.uint32, value: wp.float32, rival: wp.fl
             r.offered += square
         if wp.abs(rival) < LARGEST_CONTRIBUTION * LARGEST_CONTRIBUTION:
             r.excess += rival
+            r.largest = wp.max(r.largest, rival)
     elif rival >= 0.0 and square > 0.0:
         # of the light the cache would bring this part, as often as `rival`, and exploring the rest
         by_cache = choice_weight(rival, share) * rival / (rival + share)
@@ -258,18 +259,17 @@ def add_sample(m: LightMoments, word: wp.uint32, value: wp.float32, rival: wp.fl
         if share > rival:
             r.explored += explored / PROBED
         r.alone += square / PROBED
-        r.both += (offered + explored) / PROBED
-        r.by_cache += value * by_cache
-        r.by_exploring += value * (1.0 - by_cache)
+        r.cached += offered / PROBED
+        r.beside += explored / PROBED
+        r.largest = wp.max(r.largest, (offered + explored - square) / PROBED)
     return r
 
 
-# By how much both choices exceed exploring alone. The means of the two choices are lost to their variance by twice
-# their product; where exploring is alone this is at most what its second moment and the two parts of the light allow.
+# By how much both choices exceed exploring alone. Of two independent choices the variance is larger than the sum of their
+# second moments tells, by twice the product of their means: at most twice the root of the product of the moments.
 @wp.func
 def all_excess(m: LightMoments) -> wp.float32:
-    part = m.by_cache / wp.max(m.by_cache + m.by_exploring, SMALLEST_MOMENT)
-    return m.excess + m.both - m.alone * (1.0 - 2.0 * part * (1.0 - part))
+    return m.excess + m.cached + m.beside + 2.0 * wp.sqrt(m.cached * m.beside) - m.alone - m.largest
 
 
 # Thread: a leaf. Counts how often each of its lights was tried by its samples, and how often seen; and learns how
@@ -290,12 +290,12 @@ def weigh_light_samples(
     moments = wp.vec2(0.0, 0.0)
     share = float(settings.first_exploration)
     excess = float(0.0)
-    alone = settings.may_be_alone
+    alone = int(0)
     if origin >= 0:
         moments = known.moments[origin]
         share = known.exploration[origin]
         excess = known.excesses[origin]
-        alone = known.alone[origin]
+        alone = wp.where(known.buckets[origin] > 0, known.alone[origin], 0)
     count = samples.counts[leaf]
     looks = wp.min(count, samples.most)
     m = LightMoments()
