@@ -220,16 +220,26 @@ def exploration_share(moments: wp.vec2, settings: CacheSettings) -> wp.float32:
     return wp.clamp(share, settings.least_exploration, settings.most_exploration)
 
 
+PAIR_MARGIN = wp.constant(wp.float32(1.5))
+SIGHTINGS = wp.constant(wp.float32(4.0))  # of each light, with which a region starts without exploring alone
+
+
 # Sums over light samples of squared luminances, of a region.
 @wp.struct
 class LightMoments:
     offered: wp.float32  # of those by the cache
     explored: wp.float32  # of those by exploring, of lights that the cache does not offer
     excess: wp.float32  # by how much both choices together exceed exploring alone
-    # of samples by exploring alone, that know what the cache would do
+    # Of samples by exploring alone:
+    last: wp.float32  # what the last one brought, and the sum of its products with the one before
+    pairs: wp.float32
+    # of those that know what the cache would do
     alone: wp.float32  # their second moment
     cached: wp.float32  # that of the cache's choice, and of the choice to explore beside it
     beside: wp.float32
+    by_cache: wp.float32  # luminance that these two would bring
+    by_exploring: wp.float32
+    # of all
     largest: wp.float32  # of a sample, what it adds to `excess` or to how much these two exceed `alone`
 
 
@@ -248,28 +258,37 @@ def add_sample(m: LightMoments, word: wp.uint32, value: wp.float32, rival: wp.fl
         if wp.abs(rival) < LARGEST_CONTRIBUTION * LARGEST_CONTRIBUTION:
             r.excess += rival
             r.largest = wp.max(r.largest, rival)
-    elif rival >= 0.0 and square > 0.0:
+        return r
+    if square > 0.0:
+        r.pairs += value * m.last
+    r.last = wp.sqrt(square)
+    if rival >= 0.0 and square > 0.0:
         # of the light the cache would bring this part, as often as `rival`, and exploring the rest
-        by_cache = choice_weight(rival, share) * rival / (rival + share)
+        part = choice_weight(rival, share) * rival / (rival + share)
         offered = float(0.0)
         if rival > 0.0:
-            offered = square * by_cache * by_cache / rival
-        explored = square * (1.0 - by_cache) * (1.0 - by_cache) / share
+            offered = square * part * part / rival
+        explored = square * (1.0 - part) * (1.0 - part) / share
         r.offered += offered / PROBED
         if share > rival:
             r.explored += explored / PROBED
         r.alone += square / PROBED
         r.cached += offered / PROBED
         r.beside += explored / PROBED
+        r.by_cache += value * part
+        r.by_exploring += value * (1.0 - part)
         r.largest = wp.max(r.largest, (offered + explored - square) / PROBED)
     return r
 
 
-# By how much both choices exceed exploring alone. Of two independent choices the variance is larger than the sum of their
-# second moments tells, by twice the product of their means: at most twice the root of the product of the moments.
+# By how much both choices exceed exploring alone. Of two independent choices the variance is larger than the sum of
+# their second moments tells, by twice the product of their means: at most twice the root of the product of the moments,
+# and of what a point gets the square is about the product of two samples next to each other.
 @wp.func
 def all_excess(m: LightMoments) -> wp.float32:
-    return m.excess + m.cached + m.beside + 2.0 * wp.sqrt(m.cached * m.beside) - m.alone - m.largest
+    part = m.by_cache / wp.max(m.by_cache + m.by_exploring, SMALLEST_MOMENT)
+    product = wp.min(PAIR_MARGIN * part * (1.0 - part) * m.pairs, wp.sqrt(m.cached * m.beside))
+    return m.excess + m.cached + m.beside + 2.0 * product - m.alone - m.largest
 
 
 # Thread: a leaf. Counts how often each of its lights was tried by its samples, and how often seen; and learns how
@@ -290,15 +309,16 @@ def weigh_light_samples(
     moments = wp.vec2(0.0, 0.0)
     share = float(settings.first_exploration)
     excess = float(0.0)
-    alone = int(0)
+    alone = settings.may_be_alone
     if origin >= 0:
         moments = known.moments[origin]
         share = known.exploration[origin]
         excess = known.excesses[origin]
-        alone = wp.where(known.buckets[origin] > 0, known.alone[origin], 0)
+        alone = known.alone[origin]
     count = samples.counts[leaf]
     looks = wp.min(count, samples.most)
     m = LightMoments()
+    sightings = float(0.0)
     for k in range(looks):
         slot = samples.order[samples.starts[leaf] + spread_place(k, looks, count)]
         word = records.lights[slot]
@@ -309,6 +329,7 @@ def weigh_light_samples(
             seen = float(0.0)
             if (word & LIGHT_VISIBLE) != wp.uint32(0):
                 seen = 1.0
+                sightings += 1.0
             if place >= 0:
                 joined.tries[place] = joined.tries[place] + wp.vec2(seen, 1.0)
     if origin >= 0 and count > 0:
@@ -318,6 +339,8 @@ def weigh_light_samples(
             excess = excess * FADING + all_excess(m)
             if excess != 0.0 and settings.may_be_alone != 0:
                 alone = wp.where(excess > 0.0, 1, 0)
+        elif settings.may_be_alone != 0:
+            alone = wp.where(sightings < SIGHTINGS * wp.float32(joined.counts[leaf]), 1, 0)
     tables.excesses[leaf] = excess
     tables.alone[leaf] = alone
     tables.moments[leaf] = moments
