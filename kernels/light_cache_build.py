@@ -10,11 +10,18 @@ saw it: a light that is seen rarely stays for some frames, which the paper leave
 import warp as wp
 
 from warp_gi.kernels.bsdf import luminance
-from warp_gi.kernels.light_cache import MOST_BUCKETS, PROBED, CacheTables, LightCache, choice_weight
+from warp_gi.kernels.light_cache import MOST_BUCKETS, CacheTables, LightCache
+from warp_gi.kernels.light_cache_shares import (
+    CacheSettings,
+    LightMoments,
+    add_light_sample,
+    keep_exploration,
+    known_exploration,
+    learnt_exploration,
+    started_exploration,
+)
 from warp_gi.kernels.octree import NEIGHBOURS, Octree, OctreeNodes, leaf_cell
-from warp_gi.kernels.quadtree_adapt import LARGEST_CONTRIBUTION
 from warp_gi.kernels.samples import (
-    LIGHT_ALONE,
     LIGHT_BLOCKED,
     LIGHT_EXPLORED,
     LIGHT_ITEM,
@@ -41,16 +48,6 @@ class LightLists:
     counts: wp.array(dtype=wp.int32)  # [leaf]
     entries: wp.array(dtype=wp.int32)
     tries: wp.array(dtype=wp.vec2)  # of each entry: (samples that saw it, all that tried), none in what was just seen
-
-
-@wp.struct
-class CacheSettings:
-    capacity: wp.int32  # lights a bucket
-    hysteresis: wp.float32  # share of the capacity that must suffice for fewer buckets than before
-    first_exploration: wp.float32  # share of samples, of regions that nothing is known of
-    least_exploration: wp.float32
-    most_exploration: wp.float32
-    may_be_alone: wp.int32  # 1: regions learn where exploring alone is better
 
 
 # Ascending order, by Shell's method.
@@ -177,8 +174,6 @@ def join_lights(
     joined.counts[leaf] = count
 
 
-SMALLEST_MOMENT = wp.constant(wp.float32(1.0e-30))
-EXPLORATION_PRICE = wp.constant(wp.float32(0.1))  # of the error, that all samples' exploring is worth
 MOST_TRIES = wp.constant(wp.float32(32.0))  # that are remembered of a light
 
 
@@ -206,91 +201,6 @@ def find_entry(lists: LightLists, leaf: wp.int32, emitter: wp.int32) -> wp.int32
     return -1
 
 
-FADING = wp.constant(wp.float32(0.8))  # of moments, each frame
-
-
-# Share of samples that explore. What exploring brings, of lights that the cache does not offer, varies with moments[1]
-# over the share, and the rest with at most moments[0]. The share is that for which the former is EXPLORATION_PRICE
-# times the share times the latter: somewhat less than exploring costs, as unknown lights make outliers.
-@wp.func
-def exploration_share(moments: wp.vec2, settings: CacheSettings) -> wp.float32:
-    share = settings.least_exploration
-    if moments[1] > 0.0:
-        share = wp.sqrt(moments[1] / wp.max(moments[0] * EXPLORATION_PRICE, SMALLEST_MOMENT))
-    return wp.clamp(share, settings.least_exploration, settings.most_exploration)
-
-
-PAIR_MARGIN = wp.constant(wp.float32(1.5))
-SIGHTINGS = wp.constant(wp.float32(4.0))  # of each light, with which a region starts without exploring alone
-
-
-# Sums over light samples of squared luminances, of a region.
-@wp.struct
-class LightMoments:
-    offered: wp.float32  # of those by the cache
-    explored: wp.float32  # of those by exploring, of lights that the cache does not offer
-    excess: wp.float32  # by how much both choices together exceed exploring alone
-    # Of samples by exploring alone:
-    last: wp.float32  # what the last one brought, and the sum of its products with the one before
-    pairs: wp.float32
-    # of those that know what the cache would do
-    alone: wp.float32  # their second moment
-    cached: wp.float32  # that of the cache's choice, and of the choice to explore beside it
-    beside: wp.float32
-    by_cache: wp.float32  # luminance that these two would bring
-    by_exploring: wp.float32
-    # of all
-    largest: wp.float32  # of a sample, what it adds to `excess` or to how much these two exceed `alone`
-
-
-# What a sample tells of the region.
-@wp.func
-def add_sample(m: LightMoments, word: wp.uint32, value: wp.float32, rival: wp.float32, share: wp.float32) -> LightMoments:
-    r = m
-    square = float(0.0)
-    if value < LARGEST_CONTRIBUTION:
-        square = value * value
-    if (word & LIGHT_ALONE) == wp.uint32(0):
-        if (word & LIGHT_EXPLORED) != wp.uint32(0):
-            r.explored += square
-        elif (word & LIGHT_VISIBLE) != wp.uint32(0):
-            r.offered += square
-        if wp.abs(rival) < LARGEST_CONTRIBUTION * LARGEST_CONTRIBUTION:
-            r.excess += rival
-            r.largest = wp.max(r.largest, rival)
-        return r
-    if square > 0.0:
-        r.pairs += value * m.last
-    r.last = wp.sqrt(square)
-    if rival >= 0.0 and square > 0.0:
-        # of the light the cache would bring this part, as often as `rival`, and exploring the rest
-        part = choice_weight(rival, share) * rival / (rival + share)
-        offered = float(0.0)
-        if rival > 0.0:
-            offered = square * part * part / rival
-        explored = square * (1.0 - part) * (1.0 - part) / share
-        r.offered += offered / PROBED
-        if share > rival:
-            r.explored += explored / PROBED
-        r.alone += square / PROBED
-        r.cached += offered / PROBED
-        r.beside += explored / PROBED
-        r.by_cache += value * part
-        r.by_exploring += value * (1.0 - part)
-        r.largest = wp.max(r.largest, (offered + explored - square) / PROBED)
-    return r
-
-
-# By how much both choices exceed exploring alone. Of two independent choices the variance is larger than the sum of
-# their second moments tells, by twice the product of their means: at most twice the root of the product of the moments,
-# and of what a point gets the square is about the product of two samples next to each other.
-@wp.func
-def all_excess(m: LightMoments) -> wp.float32:
-    part = m.by_cache / wp.max(m.by_cache + m.by_exploring, SMALLEST_MOMENT)
-    product = wp.min(PAIR_MARGIN * part * (1.0 - part) * m.pairs, wp.sqrt(m.cached * m.beside))
-    return m.excess + m.cached + m.beside + 2.0 * product - m.alone - m.largest
-
-
 # Thread: a leaf. Counts how often each of its lights was tried by its samples, and how often seen; and learns how
 # much to explore, and whether to do so alone.
 @wp.kernel
@@ -305,46 +215,27 @@ def weigh_light_samples(
     tables: CacheTables,
 ):
     leaf = first + wp.tid()
-    origin = origins[leaf]
-    moments = wp.vec2(0.0, 0.0)
-    share = float(settings.first_exploration)
-    excess = float(0.0)
-    alone = settings.may_be_alone
-    if origin >= 0:
-        moments = known.moments[origin]
-        share = known.exploration[origin]
-        excess = known.excesses[origin]
-        alone = known.alone[origin]
+    e = known_exploration(known, origins[leaf], settings)
     count = samples.counts[leaf]
     looks = wp.min(count, samples.most)
     m = LightMoments()
-    sightings = float(0.0)
+    sightings = int(0)
     for k in range(looks):
         slot = samples.order[samples.starts[leaf] + spread_place(k, looks, count)]
         word = records.lights[slot]
-        m = add_sample(m, word, records.light_values[slot], records.rivals[slot], share)
+        m = add_light_sample(m, word, records.light_values[slot], records.rivals[slot], e.share)
         was_tried = (word & (LIGHT_VISIBLE | LIGHT_BLOCKED)) != wp.uint32(0)
         if was_tried and (word & LIGHT_EXPLORED) == wp.uint32(0):
             place = find_entry(joined, leaf, wp.int32(word & LIGHT_ITEM) - 1)
-            seen = float(0.0)
-            if (word & LIGHT_VISIBLE) != wp.uint32(0):
-                seen = 1.0
-                sightings += 1.0
+            seen = wp.int32((word & LIGHT_VISIBLE) != wp.uint32(0))
+            sightings += seen
             if place >= 0:
-                joined.tries[place] = joined.tries[place] + wp.vec2(seen, 1.0)
-    if origin >= 0 and count > 0:
-        if known.buckets[origin] > 0:  # else all of the light came by exploring, which says nothing
-            moments = moments * FADING + wp.vec2(m.offered, m.explored * share)
-            share = exploration_share(moments, settings)
-            excess = excess * FADING + all_excess(m)
-            if excess != 0.0 and settings.may_be_alone != 0:
-                alone = wp.where(excess > 0.0, 1, 0)
-        elif settings.may_be_alone != 0:
-            alone = wp.where(sightings < SIGHTINGS * wp.float32(joined.counts[leaf]), 1, 0)
-    tables.excesses[leaf] = excess
-    tables.alone[leaf] = alone
-    tables.moments[leaf] = moments
-    tables.exploration[leaf] = wp.clamp(share, settings.least_exploration, settings.most_exploration)
+                joined.tries[place] = joined.tries[place] + wp.vec2(wp.float32(seen), 1.0)
+    if e.has_lights and count > 0:
+        e = learnt_exploration(e, m, settings)
+    elif count > 0:  # all of the light came by exploring, which says nothing of what the cache would do
+        e = started_exploration(e, sightings, joined.counts[leaf], settings)
+    keep_exploration(tables, leaf, e, settings)
     begin = joined.offsets[leaf]
     for i in range(begin, begin + joined.counts[leaf]):
         tries = joined.tries[i]
