@@ -24,7 +24,9 @@ wp.set_module_options({"enable_backward": False})
 VISIBLE, BLOCKED, GLOSSY, EXPLORED = 1 << 31, 1 << 30, 1 << 29, 1 << 28
 ALONE = 1 << 27
 ITEM = (1 << 27) - 1
-OUTCOMES = np.array([0, BLOCKED, VISIBLE, VISIBLE | EXPLORED, VISIBLE | ALONE, BLOCKED | ALONE])  # of light samples that are kept
+OUTCOMES = np.array(
+    [0, BLOCKED, VISIBLE, VISIBLE | EXPLORED, VISIBLE | ALONE, BLOCKED | ALONE]
+)  # of light samples that are kept
 ROUNDING = 2e-3, 1.5e-5  # of a weight: relative, and times the light's luminance
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 

@@ -56,7 +56,7 @@ FADING = 0.8
 PRICE = 0.1  # of exploring
 PROBED = 0.125  # of samples that explore alone, those that ask what the cache would do
 PAIR_MARGIN = 1.5
-SIGHTINGS = 2
+SIGHTINGS = 3
 LARGEST = 1e15  # samples beyond say nothing
 MAIN = -1.0
 
@@ -481,7 +481,7 @@ def expected_weights(settings, grouped, records, entries, tries, origins, known)
             moment, share = known.moments.numpy()[origin].astype(np.float64), float(known.exploration.numpy()[origin])
             excess, is_alone = float(known.excesses.numpy()[origin]), int(known.alone.numpy()[origin])
         brought = {"offered": 0.0, "explored": 0.0}
-        gains, probes, pairs, last, parts, sightings = [0.0], [], 0.0, 0.0, np.zeros(2), 0
+        gains, probes, pairs, last, parts, sightings = 0.0, 0, 0.0, 0.0, np.zeros(2), 0
         both = np.zeros(3)
         looks = min(counts[leaf], grouped.most)
         for k in range(looks):
@@ -490,13 +490,14 @@ def expected_weights(settings, grouped, records, entries, tries, origins, known)
             emitter, seen = (word & ITEM) - 1, bool(word & VISIBLE)
             if word & EXPLORED:
                 brought["explored"] += square
-                gains += [rivals[slot]] if abs(rivals[slot]) < LARGEST**2 else []
+                gains += rivals[slot] if abs(rivals[slot]) < LARGEST**2 else 0.0
                 continue
             sightings += seen
             if word & ALONE:
                 pairs += last * np.sqrt(square)
                 last = np.sqrt(square)
                 odds = rivals[slot]
+                probes += odds >= 0
                 if odds >= 0 and square > 0:
                     # estimates of the two choices' second moments, with the power heuristic's weights
                     own, other = odds**2 / (odds**2 + share**2), share**2 / (odds**2 + share**2)
@@ -506,21 +507,23 @@ def expected_weights(settings, grouped, records, entries, tries, origins, known)
                     brought["explored"] += explored_too / PROBED * (share > odds)
                     both += np.array([offered, explored_too, square]) / PROBED
                     parts += np.array([own, other]) * values[slot]
-                    probes.append((offered + explored_too - square) / PROBED)
             else:
                 brought["offered"] += square * seen
-                gains += [rivals[slot]] if abs(rivals[slot]) < LARGEST**2 else []
+                gains += rivals[slot] if abs(rivals[slot]) < LARGEST**2 else 0.0
             if emitter in counted and (seen or word & BLOCKED):
                 counted[emitter][0] += seen
                 counted[emitter][1] += 1
         if origin >= 0 and counts[leaf] > 0:
             if known.buckets.numpy()[origin] > 0:
-                moment = FADING * moment + (brought["offered"], brought["explored"] * share)
+                unmet = both[2] / max(probes, 1)  # as if one more had found a light that the cache does not offer
+                most = brought["offered"] + brought["explored"] * share
+                moment = FADING * moment + (brought["offered"], brought["explored"] * share + unmet)
+                both[1] += unmet / share
                 # as much as makes the noise of exploring a quarter of the rest's times the share
                 share = np.sqrt(moment[1] / max(PRICE * moment[0], 1e-30)) if moment[1] > 0 else 0.0
                 part = parts[0] / max(parts.sum(), 1e-30)
                 product = min(PAIR_MARGIN * part * (1 - part) * pairs, np.sqrt(both[0] * both[1]))
-                excess = FADING * excess + sum(gains) + both @ [1, 1, -1] + 2 * product - max(gains + probes)
+                excess = FADING * excess + min(gains + both @ [1, 1, -1] + 2 * product, most)
                 if settings.may_be_alone and excess != 0:
                     is_alone = int(excess > 0)
             elif settings.may_be_alone:
@@ -734,7 +737,10 @@ def test_a_region_knows_what_it_and_its_neighbours_saw():
         learnt = expected_weights(*given)
         state = estimator.learn(lesson, state)
         assert entries_of(state.known) == expected
-        found = [tries_of(state.known), *(getattr(state.tables, n).numpy() for n in ("moments", "exploration", "excesses", "alone"))]
+        found = [
+            tries_of(state.known),
+            *(getattr(state.tables, n).numpy() for n in ("moments", "exploration", "excesses", "alone")),
+        ]
         check_weights(found, learnt)
         tries = found[0]
         importances, rates = importances_of(frame.lights.data, cells_of(lesson)), rates_of(state.tables)
@@ -793,7 +799,10 @@ def test_threads_do_not_matter():
                     used,
                     rates_of(t),
                     tries_of(state.known),
-                    *(x.numpy().tolist() for x in (t.buckets, t.offsets, t.exploration, t.moments, t.excesses, t.alone)),
+                    *(
+                        x.numpy().tolist()
+                        for x in (t.buckets, t.offsets, t.exploration, t.moments, t.excesses, t.alone)
+                    ),
                 )
             )
     finally:

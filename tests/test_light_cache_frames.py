@@ -377,7 +377,11 @@ def test_paths_weigh_both_samples(sort):
         assert len(values) == 4 * SIZE[0] * SIZE[1]
         if index == 0:  # nothing is known
             whole = values.mean()
-            assert alone.all() and not explored.any() and np.allclose(frame.numpy("emitters") @ LUMINANCE, whole, rtol=noise)
+            assert (
+                alone.all()
+                and not explored.any()
+                and np.allclose(frame.numpy("emitters") @ LUMINANCE, whole, rtol=noise)
+            )
         else:  # the cache's sample is kept, and four pixels' samples explored zero to four times
             assert not (explored | alone).any() and np.allclose(values, whole / (1.0 + share**2), rtol=noise)
             counted = (frame.numpy("emitters") @ LUMINANCE / whole * (1.0 + share**2) - 1.0) / share * 4

@@ -96,7 +96,9 @@ class VisibilityLightCache(Estimator):
         places, areas = _places(scene.data(device))
         radiances = scene.emitter_powers() / (np.pi * np.maximum(areas, 1e-30)) * (areas > 0)
         luminances = launch.on_device(radiances.astype(np.float32), wp.float32, device)
-        return CacheState(_tables(8, device, self.exploration, self.adapts_exploration), _lists(8, device), places, tree, luminances)
+        return CacheState(
+            _tables(8, device, self.exploration, self.adapts_exploration), _lists(8, device), places, tree, luminances
+        )
 
     def preprocess(self, frame: Any, state: CacheState | None) -> CacheState | None:
         """Bring the shapes of lights and the table of exploration up to the frame, and give paths the cache."""
@@ -167,7 +169,10 @@ class VisibilityLightCache(Estimator):
         joined.entries = wp.zeros(size, dtype=wp.int32, device=device)
         joined.tries = wp.zeros(size, dtype=wp.vec2, device=device)
         lesson.launch(light_cache_build.join_lights, [*around, joined, self.memory])
-        tables, sizes = _tables(leaves, device, self.exploration, self.adapts_exploration), wp.empty(leaves, dtype=wp.int32, device=device)
+        tables, sizes = (
+            _tables(leaves, device, self.exploration, self.adapts_exploration),
+            wp.empty(leaves, dtype=wp.int32, device=device),
+        )
         inputs = [settings, samples, lesson.records, joined, origins, state.tables, tables]
         lesson.launch(light_cache_build.weigh_light_samples, inputs)
 
