@@ -12,6 +12,8 @@ lights (or an alias table, the paper's way). Either can yield any light: both ar
 that estimates are unbiased whatever the cache holds. (Algorithm 1 explores instead, and mixes both probabilities. A
 sample that explores in vain is then missing from the estimate: with a share e the relative variance grows by about e,
 which was more than half of all there was, and made regions explore too little to find what they did not know.)
+
+Regions that see more lights than their buckets hold leave the choice to exploring alone (light_cache_shares.py).
 """
 
 import warp as wp

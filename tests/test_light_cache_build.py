@@ -56,6 +56,7 @@ FADING = 0.8
 PRICE = 0.1  # of exploring
 PROBED = 0.125  # of samples that explore alone, those that ask what the cache would do
 PAIR_MARGIN = 1.5
+LEARNT_TABLES = ("moments", "exploration", "excesses", "alone")
 SIGHTINGS = 3
 LARGEST = 1e15  # samples beyond say nothing
 MAIN = -1.0
@@ -464,7 +465,7 @@ def weighed(settings, grouped, records, entries, tries, origins, known):
     inputs = [settings, grouped, records, given, array(origins), known, tables]
     launch(light_cache_build.weigh_light_samples, leaves, inputs, device(), 16)
     assert entries_of(given) == entries
-    return tries_of(given), *(getattr(tables, name).numpy() for name in ("moments", "exploration", "excesses", "alone"))
+    return tries_of(given), *(getattr(tables, name).numpy() for name in LEARNT_TABLES)
 
 
 def expected_weights(settings, grouped, records, entries, tries, origins, known):
@@ -739,7 +740,7 @@ def test_a_region_knows_what_it_and_its_neighbours_saw():
         assert entries_of(state.known) == expected
         found = [
             tries_of(state.known),
-            *(getattr(state.tables, n).numpy() for n in ("moments", "exploration", "excesses", "alone")),
+            *(getattr(state.tables, n).numpy() for n in LEARNT_TABLES),
         ]
         check_weights(found, learnt)
         tries = found[0]
@@ -799,10 +800,7 @@ def test_threads_do_not_matter():
                     used,
                     rates_of(t),
                     tries_of(state.known),
-                    *(
-                        x.numpy().tolist()
-                        for x in (t.buckets, t.offsets, t.exploration, t.moments, t.excesses, t.alone)
-                    ),
+                    *(getattr(t, name).numpy().tolist() for name in ("buckets", "offsets", *LEARNT_TABLES)),
                 )
             )
     finally:

@@ -1,4 +1,4 @@
-"""The light cache where more lights are seen than it holds: regions leave the choice to the hierarchy, and only there."""
+"""The light cache where more lights are seen than it holds: there, and only there, the hierarchy alone selects."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def test_excess_is_that_of_the_variances(alone):
     found, scale = learnt_excess(frame, data, spots, brings, count, rng) / count, cached + beside + by_hierarchy
     shines = (scale > 0) & (tables.buckets.numpy() > 0)[spots.regions.numpy()]
     off = np.abs(found - np.minimum(exact, most))[shines] / scale[shines]
-    assert off.max() < (0.06 if alone else 0.03), off.max()
+    assert off.max() < (0.06 if alone else 0.05), off.max()
     assert shines.sum() > 50 and (exact[shines] > 0.1 * scale[shines]).any()
     assert alone or (exact[shines] < -0.1 * scale[shines]).any()
 
@@ -205,7 +205,7 @@ def divided(a, b):
 def learnt_excess(frame, data, spots, brings, count, rng):
     """Float64 [spot] of regions at each of the spots, from ``count`` samples that bring what lights there bring."""
     places = len(brings)
-    first, second = expected_times(frame, data, spots)
+    _, second = expected_times(frame, data, spots)
     assert np.array_equal(alone_at(data, spots), (second == 0).all(axis=1))
     regions = samples.SampleRegions()
     regions.records = records_of(np.zeros(places * count), np.zeros(places * count))
