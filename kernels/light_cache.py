@@ -231,7 +231,7 @@ def offered_pdf(cache: LightCache, here: CacheRegion, s: Surface, wo: wp.vec3, e
     return found.bucket.chance * weighed.weights[found.place] / weighed.total
 
 
-PROBED = wp.constant(wp.float32(0.125))  # share of samples that ask what the cache would do, where exploring is alone
+PROBED = wp.constant(wp.float32(0.5))  # share of samples that ask what the cache would do, where exploring is alone
 
 
 # One of all lights, as the hierarchy by itself would select it. Some ask how likely it is by the cache, so that the

@@ -131,11 +131,11 @@ def variance_excess(m: LightMoments, share: wp.float32) -> wp.float32:
     return wp.min(excess, m.offered + m.explored * share)
 
 
-# Of lights that the cache does not offer, and which the few samples that asked may all have missed: as if one more had
-# found one.
+# Of lights that the cache does not offer, and which the few samples that asked may all have missed: as if of all that
+# are remembered one more had found one.
 @wp.func
 def unmet_moment(m: LightMoments) -> wp.float32:
-    return m.alone / wp.max(m.probes, 1.0)
+    return (1.0 - FADING) * m.alone / wp.max(m.probes, 1.0)
 
 
 # What the region `origin` knew.

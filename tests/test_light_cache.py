@@ -332,10 +332,10 @@ def test_choices_follow_the_probabilities(kind, explores_by):
         rarely = (own <= other)[rows, items][found]  # the cache offers it more often
         assert np.array_equal(flags[found], np.where(rarely, 2, 1) if explores else np.zeros(found.sum()))
         assert np.array_equal(says_alone[found], np.broadcast_to(alone[:, None], found.shape)[found])
-        # the chance of being selected the other way; where exploring is alone, an eighth asks for that
+        # the chance of being selected the other way; where exploring is alone, a half asks for that
         told = found & ~alone[:, None]
         assert np.allclose(others[told], by_hierarchy[rows, items][told], rtol=1e-5)
-        told = found & alone[:, None] & (numbers[:, 1] < 0.125)
+        told = found & alone[:, None] & (numbers[:, 1] < 0.5)
         told &= (data.tables.buckets.numpy() > 0)[spots.regions.numpy()][:, None]
         assert np.allclose(others[told], offered[rows, items][told], rtol=1e-5) and told.any() == (explores == 0)
         assert (others[found & alone[:, None] & ~told] == -1).all()

@@ -54,7 +54,7 @@ LEAST_CHANCE = 0.02
 MOST_TRIES = 32
 FADING = 0.8
 PRICE = 0.1  # of exploring
-PROBED = 0.125  # of samples that explore alone, those that ask what the cache would do
+PROBED = 0.5  # of samples that explore alone, those that ask what the cache would do
 PAIR_MARGIN = 1.5
 LEARNT_TABLES = ("moments", "exploration", "excesses", "alone")
 SIGHTINGS = 3
@@ -516,7 +516,9 @@ def expected_weights(settings, grouped, records, entries, tries, origins, known)
                 counted[emitter][1] += 1
         if origin >= 0 and counts[leaf] > 0:
             if known.buckets.numpy()[origin] > 0:
-                unmet = both[2] / max(probes, 1)  # as if one more had found a light that the cache does not offer
+                unmet = (
+                    (1 - FADING) * both[2] / max(probes, 1)
+                )  # as if one had found what the cache lacks
                 most = brought["offered"] + brought["explored"] * share
                 moment = FADING * moment + (brought["offered"], brought["explored"] * share + unmet)
                 both[1] += unmet / share
