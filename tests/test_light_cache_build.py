@@ -516,9 +516,7 @@ def expected_weights(settings, grouped, records, entries, tries, origins, known)
                 counted[emitter][1] += 1
         if origin >= 0 and counts[leaf] > 0:
             if known.buckets.numpy()[origin] > 0:
-                unmet = (
-                    (1 - FADING) * both[2] / max(probes, 1)
-                )  # as if one had found what the cache lacks
+                unmet = (1 - FADING) * both[2] / max(probes, 1)  # as if one had found what the cache lacks
                 most = brought["offered"] + brought["explored"] * share
                 moment = FADING * moment + (brought["offered"], brought["explored"] * share + unmet)
                 both[1] += unmet / share

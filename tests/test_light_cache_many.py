@@ -53,15 +53,16 @@ def lamps(side, corner, u, v, powers):
     return meshes
 
 
-def wall_of_lamps(side, powers="equal", hidden=0.0, roughness=None):
-    """A floor, and behind it a wall of lamps, a share of which is behind a screen."""
+def wall_of_lamps(side, powers="equal", hidden=0.0, roughness=None, above=False):
+    """A floor, and behind or above it a wall of lamps, a share of which is behind a screen."""
     rng = np.random.default_rng(3)
-    sizes = np.ones(side * side) if powers == "equal" else 10 ** (rng.integers(-16, 5, side * side) / 4)
+    sizes = np.ones(side * side) if powers == "equal" else 10 ** (rng.integers(-4, 5, side * side) / 4)
     floor = gi.Material("floor", (0.5, 0.5, 0.5), specular=0.0)
     if roughness is not None:
         floor = gi.Material("floor", (0.4, 0.4, 0.4), roughness=roughness)
     meshes = [quad((-3, 0, -2), (0, 0, 6), (6, 0, 0), floor)]
-    meshes += lamps(side, (-3, 0.1, -2), (6, 0, 0), (0, 6, 0), sizes)
+    place = ((-3, 3, -2), (6, 0, 0), (0, 0, 6)) if above else ((-3, 0.1, -2), (6, 0, 0), (0, 6, 0))
+    meshes += lamps(side, *place, sizes)
     if hidden:
         black = gi.Material("black", (0, 0, 0), specular=0.0)
         meshes.append(quad((-3, 0, -1.9), (6 * hidden, 0, 0), (0, 6.5, 0), black))
@@ -107,11 +108,11 @@ def ratio(ours, theirs):
 
 @pytest.mark.parametrize(
     "settings",
-    [{"side": 40}, {"side": 40, "roughness": 0.3}, {"side": 40, "powers": "unequal"}, {"side": 10}],
+    [{"side": 40}, {"side": 40, "roughness": 0.3, "above": True}, {"side": 40, "powers": "unequal"}, {"side": 10}],
     ids=["3200 equal", "3200 equal, GGX", "3200 unequal", "200 equal"],
 )
 def test_lights_beyond_the_capacity_vary_no_more_than_by_the_hierarchy(settings):
-    """From the third frame on. (With the cache and exploring beside it everywhere: 2.2 to 6 times.)"""
+    """From the third frame on. (With the cache and exploring beside it everywhere: 1.4 to 3.3 times.)"""
     scene, seeds, frames = wall_of_lamps(**settings), range(1, 9), range(3, 14)
     ours, theirs = (rendered(scene, e, seeds, frames) for e in (gi.VisibilityLightCache(), gi.LightHierarchy()))
     assert ratio(ours, theirs) <= BOUND + NOISE, ratio(ours, theirs)
