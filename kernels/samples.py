@@ -132,7 +132,7 @@ def keep_light(data: SampleRegions, slot: wp.int32, choice: LightChoice, visible
         return
     before = data.records.lights[slot]
     if choice.alone != 0:
-        data.records.rivals[slot] = choice.other / choice.pdf
+        data.records.rivals[slot] = choice.other / wp.max(choice.pdf, LEAST_PROBABILITY)
     elif visible > 0:
         # With one choice the light would have brought `light` times pdf / (weight * other), and been selected `other`
         # times instead of pdf / weight. Both choices are independent: their product estimates that of their means,
