@@ -26,6 +26,8 @@ class LightChoice:
     pdf: wp.float32  # expected number of times that it is selected: a probability, where one choice is made
     weight: wp.float32  # factor of what it brings; 1, where one choice is made
     explores: wp.int32  # found by exploring: 1; 2, where the cache selects the light more often than that
+    alone: wp.int32  # 1: by exploring, as the only choice there is
+    other: wp.float32  # probability of it by exploring alone; if `alone`, by the cache, below 0 where nobody asked
 
 
 # radiance is over pdf already for lights without size (delta = 1), whose pdf is the

@@ -12,6 +12,8 @@ lights (or an alias table, the paper's way). Either can yield any light: both ar
 that estimates are unbiased whatever the cache holds. (Algorithm 1 explores instead, and mixes both probabilities. A
 sample that explores in vain is then missing from the estimate: with a share e the relative variance grows by about e,
 which was more than half of all there was, and made regions explore too little to find what they did not know.)
+
+Regions that see more lights than their buckets hold leave the choice to exploring alone (light_cache_shares.py).
 """
 
 import warp as wp
@@ -39,8 +41,10 @@ class CacheTables:
     items: wp.array(dtype=wp.int32)  # of each leaf: where its buckets end, then the emitters bucket by bucket
     rates: wp.array(dtype=wp.float32)  # [as items] factors of the weights of lights
     chances: wp.array(dtype=wp.float32)  # of each leaf: of its buckets up to this one together; 1 for the last
-    exploration: wp.array(dtype=wp.float32)  # [leaf] share of samples that explore
+    exploration: wp.array(dtype=wp.float32)  # [leaf] share of samples that explore, beside one of the cache
+    alone: wp.array(dtype=wp.int32)  # [leaf] 1: exploring selects the only light, and the cache none
     moments: wp.array(dtype=wp.vec2)  # [leaf] second moments of light samples that do not explore, and that do
+    excesses: wp.array(dtype=wp.float32)  # [leaf] by how much these together exceed those of exploring alone
 
 
 @wp.struct
@@ -59,6 +63,7 @@ class CacheRegion:
     buckets: wp.int32
     items: wp.int32  # start of its table
     explores: wp.float32  # probability of exploring
+    alone: wp.bool  # exploring selects the only light
 
 
 @wp.struct
@@ -73,9 +78,12 @@ def cache_region(cache: LightCache, region: wp.int32) -> CacheRegion:
     r = CacheRegion()
     r.buckets = cache.tables.buckets[region]
     r.explores = 1.0
+    r.alone = True
     if r.buckets > 0:
         r.items = cache.tables.offsets[region]
-        r.explores = cache.tables.exploration[region]
+        r.alone = cache.tables.alone[region] != 0
+        if not r.alone:
+            r.explores = cache.tables.exploration[region]
     return r
 
 
@@ -213,14 +221,44 @@ def choice_weight(pdf: wp.float32, other: wp.float32) -> wp.float32:
     return a * (a + b) / (a * a + b * b)
 
 
-# One of the lights that the cache offers.
+# Number of times that the cache selects an emitter, a probability; or would, where exploring is alone.
+@wp.func
+def offered_pdf(cache: LightCache, here: CacheRegion, s: Surface, wo: wp.vec3, emitter: wp.int32) -> wp.float32:
+    found = find_light(cache.tables, here, emitter)
+    if found.place < 0:
+        return 0.0
+    weighed = weigh_bucket(cache, s, wo, found.bucket)
+    return found.bucket.chance * weighed.weights[found.place] / weighed.total
+
+
+PROBED = wp.constant(wp.float32(0.5))  # share of samples that ask what the cache would do, where exploring is alone
+
+
+# One of all lights, as the hierarchy by itself would select it. Some ask how likely it is by the cache, so that the
+# region learns whether that would be better. u[1] only adds digits to u[0].
+@wp.func
+def light_alone(
+    cache: LightCache, scene: SceneData, here: CacheRegion, s: Surface, wo: wp.vec3, u: wp.vec2
+) -> LightChoice:
+    r = explored_light(cache, scene, s, u)
+    r.weight = 1.0
+    r.alone = 1
+    r.other = -1.0
+    if r.item >= 0 and here.buckets > 0 and u[1] < PROBED:
+        r.other = offered_pdf(cache, here, s, wo, r.item)
+    return r
+
+
+# One of the lights that the cache offers; or where exploring is alone, one of all.
 @wp.func
 def cached_light(
     cache: LightCache, scene: SceneData, region: wp.int32, s: Surface, wo: wp.vec3, u: wp.vec2
 ) -> LightChoice:
+    here = cache_region(cache, region)
+    if here.alone:
+        return light_alone(cache, scene, here, s, wo, u)
     r = LightChoice()
     r.item = -1
-    here = cache_region(cache, region)
     if here.buckets > 0:
         number = int(0)
         while number < here.buckets - 1 and u[0] >= cache.tables.chances[here.items + number]:
@@ -240,20 +278,11 @@ def cached_light(
                 left = left - weighed.weights[k]
         r.item = cache.tables.items[bucket.begin + place]
         pdf = bucket.chance * weighed.weights[place] / weighed.total
-        explored = here.explores * explored_light_pdf(cache, scene, s, r.item)
+        r.other = explored_light_pdf(cache, scene, s, r.item)
+        explored = here.explores * r.other
         r.pdf = pdf + explored
         r.weight = choice_weight(pdf, explored)
     return r
-
-
-# Number of times that the cache selects an emitter, a probability.
-@wp.func
-def offered_pdf(cache: LightCache, here: CacheRegion, s: Surface, wo: wp.vec3, emitter: wp.int32) -> wp.float32:
-    found = find_light(cache.tables, here, emitter)
-    if found.place < 0:
-        return 0.0
-    weighed = weigh_bucket(cache, s, wo, found.bucket)
-    return found.bucket.chance * weighed.weights[found.place] / weighed.total
 
 
 # With the probability of exploring in the region, one of all lights.
@@ -264,9 +293,10 @@ def another_light(
     r = LightChoice()
     r.item = -1
     here = cache_region(cache, region)
-    if u[0] < here.explores:
+    if u[0] < here.explores and not here.alone:
         r = explored_light(cache, scene, s, wp.vec2(u[1], u[2]))
         if r.item >= 0:
+            r.other = r.pdf
             explored = here.explores * r.pdf
             pdf = offered_pdf(cache, here, s, wo, r.item)
             r.pdf = pdf + explored
@@ -282,7 +312,9 @@ def cached_light_pdf(
 ) -> wp.float32:
     here = cache_region(cache, region)
     pdf = here.explores * explored_light_pdf(cache, scene, s, emitter)
-    return pdf + offered_pdf(cache, here, s, wo, emitter)
+    if not here.alone:
+        pdf += offered_pdf(cache, here, s, wo, emitter)
+    return pdf
 
 
 CACHED_LIGHTS = LightSampler("cache", LightCache, cached_light, cached_light_pdf, another_light)

@@ -11,9 +11,24 @@ import warp as wp
 
 from warp_gi.kernels.bsdf import luminance
 from warp_gi.kernels.light_cache import MOST_BUCKETS, CacheTables, LightCache
+from warp_gi.kernels.light_cache_shares import (
+    CacheSettings,
+    LightMoments,
+    add_light_sample,
+    keep_exploration,
+    known_exploration,
+    learnt_exploration,
+    started_exploration,
+)
 from warp_gi.kernels.octree import NEIGHBOURS, Octree, OctreeNodes, leaf_cell
-from warp_gi.kernels.quadtree_adapt import LARGEST_CONTRIBUTION
-from warp_gi.kernels.samples import LIGHT_BLOCKED, LIGHT_EXPLORED, LIGHT_ITEM, LIGHT_VISIBLE, LeafSamples, SampleRecords
+from warp_gi.kernels.samples import (
+    LIGHT_BLOCKED,
+    LIGHT_EXPLORED,
+    LIGHT_ITEM,
+    LIGHT_VISIBLE,
+    LeafSamples,
+    SampleRecords,
+)
 from warp_gi.kernels.sampling import spread_place
 from warp_gi.kernels.types import EMITTER_DIRECTIONAL, EMITTER_TRIANGLE
 
@@ -33,15 +48,6 @@ class LightLists:
     counts: wp.array(dtype=wp.int32)  # [leaf]
     entries: wp.array(dtype=wp.int32)
     tries: wp.array(dtype=wp.vec2)  # of each entry: (samples that saw it, all that tried), none in what was just seen
-
-
-@wp.struct
-class CacheSettings:
-    capacity: wp.int32  # lights a bucket
-    hysteresis: wp.float32  # share of the capacity that must suffice for fewer buckets than before
-    first_exploration: wp.float32  # share of samples, of regions that nothing is known of
-    least_exploration: wp.float32
-    most_exploration: wp.float32
 
 
 # Ascending order, by Shell's method.
@@ -168,8 +174,6 @@ def join_lights(
     joined.counts[leaf] = count
 
 
-SMALLEST_MOMENT = wp.constant(wp.float32(1.0e-30))
-EXPLORATION_PRICE = wp.constant(wp.float32(0.1))  # of the error, that all samples' exploring is worth
 MOST_TRIES = wp.constant(wp.float32(32.0))  # that are remembered of a light
 
 
@@ -197,22 +201,8 @@ def find_entry(lists: LightLists, leaf: wp.int32, emitter: wp.int32) -> wp.int32
     return -1
 
 
-FADING = wp.constant(wp.float32(0.8))  # of moments, each frame
-
-
-# Share of samples that explore. What exploring brings, of lights that the cache does not offer, varies with moments[1]
-# over the share, and the rest with at most moments[0]. The share is that for which the former is EXPLORATION_PRICE
-# times the share times the latter: somewhat less than exploring costs, as unknown lights make outliers.
-@wp.func
-def exploration_share(moments: wp.vec2, settings: CacheSettings) -> wp.float32:
-    share = settings.least_exploration
-    if moments[1] > 0.0:
-        share = wp.sqrt(moments[1] / wp.max(moments[0] * EXPLORATION_PRICE, SMALLEST_MOMENT))
-    return wp.clamp(share, settings.least_exploration, settings.most_exploration)
-
-
 # Thread: a leaf. Counts how often each of its lights was tried by its samples, and how often seen; and learns how
-# much to explore.
+# much to explore, and whether to do so alone.
 @wp.kernel
 def weigh_light_samples(
     first: wp.int32,
@@ -225,38 +215,27 @@ def weigh_light_samples(
     tables: CacheTables,
 ):
     leaf = first + wp.tid()
-    origin = origins[leaf]
-    moments = wp.vec2(0.0, 0.0)
-    share = float(settings.first_exploration)
-    if origin >= 0:
-        moments = known.moments[origin]
-        share = known.exploration[origin]
+    e = known_exploration(known, origins[leaf], settings)
     count = samples.counts[leaf]
     looks = wp.min(count, samples.most)
-    offered = float(0.0)
-    explored = float(0.0)
+    m = LightMoments()
+    sightings = int(0)
     for k in range(looks):
         slot = samples.order[samples.starts[leaf] + spread_place(k, looks, count)]
         word = records.lights[slot]
-        value = records.light_values[slot]
-        if (word & LIGHT_EXPLORED) != wp.uint32(0):
-            if value < LARGEST_CONTRIBUTION:
-                explored += value * value
-        elif (word & (LIGHT_VISIBLE | LIGHT_BLOCKED)) != wp.uint32(0):
+        m = add_light_sample(m, word, records.light_values[slot], records.rivals[slot], e.share)
+        was_tried = (word & (LIGHT_VISIBLE | LIGHT_BLOCKED)) != wp.uint32(0)
+        if was_tried and (word & LIGHT_EXPLORED) == wp.uint32(0):
             place = find_entry(joined, leaf, wp.int32(word & LIGHT_ITEM) - 1)
-            seen = float(0.0)
-            if (word & LIGHT_VISIBLE) != wp.uint32(0):
-                seen = 1.0
-                if value < LARGEST_CONTRIBUTION:
-                    offered += value * value
+            seen = wp.int32((word & LIGHT_VISIBLE) != wp.uint32(0))
+            sightings += seen
             if place >= 0:
-                joined.tries[place] = joined.tries[place] + wp.vec2(seen, 1.0)
-    if origin >= 0 and count > 0:
-        if known.buckets[origin] > 0:  # else all of the light came by exploring, which says nothing
-            moments = moments * FADING + wp.vec2(offered, explored * share)
-            share = exploration_share(moments, settings)
-    tables.moments[leaf] = moments
-    tables.exploration[leaf] = wp.clamp(share, settings.least_exploration, settings.most_exploration)
+                joined.tries[place] = joined.tries[place] + wp.vec2(wp.float32(seen), 1.0)
+    if e.has_lights and count > 0:
+        e = learnt_exploration(e, m, settings)
+    elif count > 0:  # all of the light came by exploring, which says nothing of what the cache would do
+        e = started_exploration(e, sightings, joined.counts[leaf], settings)
+    keep_exploration(tables, leaf, e, settings)
     begin = joined.offsets[leaf]
     for i in range(begin, begin + joined.counts[leaf]):
         tries = joined.tries[i]

@@ -22,9 +22,11 @@ LIGHT_VISIBLE = wp.constant(wp.uint32(1 << 31))
 LIGHT_BLOCKED = wp.constant(wp.uint32(1 << 30))  # something is in between
 SURFACE_GLOSSY = wp.constant(wp.uint32(1 << 29))
 LIGHT_EXPLORED = wp.constant(wp.uint32(1 << 28))
-LIGHT_ITEM = wp.constant(wp.uint32((1 << 28) - 1))  # emitter + 1; 0: none was sampled
+LIGHT_ALONE = wp.constant(wp.uint32(1 << 27))  # LightChoice.alone
+LIGHT_ITEM = wp.constant(wp.uint32((1 << 27) - 1))  # emitter + 1; 0: none was sampled
 GLOSSY_ALPHA = wp.constant(wp.float32(0.2))  # GGX alpha below which a surface counts as glossy
 NO_DIRECTION = wp.constant(wp.float32(-1.0))
+LEAST_PROBABILITY = wp.constant(wp.float32(1.0e-12))
 
 
 # Which of the two kinds of surfaces of a region, that learn a share of the BSDF each.
@@ -54,6 +56,9 @@ class SampleRecords:
     codes: wp.array(dtype=wp.uint32)  # octree cell of the point; EMPTY_CODE: no sample
     lights: wp.array(dtype=wp.uint32)  # LIGHT_*
     light_values: wp.array(dtype=wp.float32)  # luminance that the light sample brought to the picture
+    # LIGHT_ALONE: probability of the light by the cache over that by exploring, below 0: unknown. Else estimates by how
+    # much the second moment of both choices together exceeds that of exploring alone.
+    rivals: wp.array(dtype=wp.float32)
     directions: wp.array(dtype=wp.uint32)  # quadtree_pack_direction
     contributions: wp.array(dtype=wp.float32)  # luminance reflected of what came that way, but for emitters it hit
     pdfs: wp.array(dtype=wp.float32)  # 1/sr, of the direction
@@ -116,15 +121,31 @@ def keep_vertex(data: SampleRegions, slot: wp.int32, s: Surface):
     if is_glossy(s.bsdf):
         flags = SURFACE_GLOSSY
     data.records.lights[slot] = flags
+    data.records.rivals[slot] = 0.0
     data.records.contributions[slot] = NO_DIRECTION
 
 
 # Of two light samples the explored one, if it arrives and tells of a light that the cache does not offer.
 @wp.func
 def keep_light(data: SampleRegions, slot: wp.int32, choice: LightChoice, visible: wp.int32, light: wp.float32):
-    if choice.item < 0 or choice.explores > 1 or (choice.explores != 0 and visible <= 0):
+    if choice.item < 0:
         return
-    word = (data.records.lights[slot] & SURFACE_GLOSSY) | wp.uint32(choice.item + 1)
+    before = data.records.lights[slot]
+    if choice.alone != 0:
+        data.records.rivals[slot] = choice.other / wp.max(choice.pdf, LEAST_PROBABILITY)
+    elif visible > 0:
+        # With one choice the light would have brought `light` times pdf / (weight * other), and been selected `other`
+        # times instead of pdf / weight. Both choices are independent: their product estimates that of their means,
+        # which a variance loses when one choice is made of both.
+        excess = light * light * (1.0 - choice.pdf / (choice.weight * wp.max(choice.other, LEAST_PROBABILITY)))
+        if choice.explores != 0 and (before & LIGHT_VISIBLE) != wp.uint32(0):
+            excess += 2.0 * light * data.records.light_values[slot]
+        data.records.rivals[slot] = data.records.rivals[slot] + excess
+    if choice.explores > 1 or (choice.explores != 0 and visible <= 0):
+        return
+    word = (before & SURFACE_GLOSSY) | wp.uint32(choice.item + 1)
+    if choice.alone != 0:
+        word = word | LIGHT_ALONE
     if choice.explores != 0:
         word = word | LIGHT_EXPLORED
     if visible > 0:

@@ -22,8 +22,11 @@ from warp_gi.launch import copied, launch
 wp.set_module_options({"enable_backward": False})
 
 VISIBLE, BLOCKED, GLOSSY, EXPLORED = 1 << 31, 1 << 30, 1 << 29, 1 << 28
-ITEM = (1 << 28) - 1
-OUTCOMES = np.array([0, BLOCKED, VISIBLE, VISIBLE | EXPLORED])  # of light samples that are kept
+ALONE = 1 << 27
+ITEM = (1 << 27) - 1
+OUTCOMES = np.array(
+    [0, BLOCKED, VISIBLE, VISIBLE | EXPLORED, VISIBLE | ALONE, BLOCKED | ALONE]
+)  # of light samples that are kept
 ROUNDING = 2e-3, 1.5e-5  # of a weight: relative, and times the light's luminance
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
@@ -59,7 +62,10 @@ def ask_probabilities(
     offered[i, emitter] = light_cache.offered_pdf(cache, light_cache.cache_region(cache, region), s, wo, emitter)
 
 
-# `found`: pdf, weight, whether it says that it explores.
+ChoiceWords = wp.types.vector(length=5, dtype=wp.float32)
+
+
+# `found`: LightChoice's pdf, weight, explores, alone, other.
 @wp.kernel
 def choose_lights(
     first: wp.int32,
@@ -69,7 +75,7 @@ def choose_lights(
     explores: wp.int32,
     numbers: wp.array(dtype=wp.vec3),
     items: wp.array2d(dtype=wp.int32),
-    found: wp.array2d(dtype=wp.vec3),
+    found: wp.array2d(dtype=ChoiceWords),
 ):
     item = first + wp.tid()
     i = item / items.shape[1]
@@ -83,16 +89,20 @@ def choose_lights(
     else:
         choice = light_cache.cached_light(cache, scene, spots.regions[i], s, wo, wp.vec2(u[0], u[1]))
     items[i, k] = choice.item
-    found[i, k] = wp.vec3(choice.pdf, choice.weight, wp.float32(choice.explores))
+    found[i, k] = ChoiceWords(
+        choice.pdf, choice.weight, wp.float32(choice.explores), wp.float32(choice.alone), choice.other
+    )
 
 
-# Thread: a slot. Keeps a light sample as paths do.
+# Thread: a slot. Keeps a light sample as paths do; `chances` are LightChoice's pdf, weight and other.
 @wp.kernel
 def keep_lights(
     first: wp.int32,
     regions: samples.SampleRegions,
     items: wp.array(dtype=wp.int32),
     explores: wp.int32,
+    alone: wp.array(dtype=wp.int32),
+    chances: wp.array(dtype=wp.vec3),
     arrives: wp.array(dtype=wp.int32),
     values: wp.array(dtype=wp.float32),
 ):
@@ -100,6 +110,10 @@ def keep_lights(
     choice = LightChoice()
     choice.item = items[slot]
     choice.explores = explores
+    choice.alone = alone[slot]
+    choice.pdf = chances[slot][0]
+    choice.weight = chances[slot][1]
+    choice.other = chances[slot][2]
     samples.keep_light(regions, slot, choice, arrives[slot], values[slot])
 
 
@@ -214,10 +228,10 @@ def preprocessed(scene, estimator=None, state=None, time=0.0, position=(0.0, 1.0
     return frame, estimator.preprocess(frame, state)
 
 
-def table(contents, rates=None):
+def table(contents, rates=None, alone=None):
     """CacheTables of regions: lights of the first bucket, other lights, buckets of these (0: none), exploration.
 
-    Rates are at random, unless there is one for every light.
+    Rates are at random, unless there is one for every light. Nowhere is exploring alone, unless told.
     """
     rng = np.random.default_rng(4)
     buckets, offsets, items, chances, factors = [], [], [], [], []
@@ -239,6 +253,7 @@ def table(contents, rates=None):
     tables.items, tables.chances = array(np.array(items, np.int32)), array(chances, wp.float32)
     tables.rates = array(factors, wp.float32)
     tables.exploration = array([share for *_, share in contents], wp.float32)
+    tables.alone = array(np.zeros(len(contents)) if alone is None else alone)
     return tables
 
 
@@ -256,6 +271,7 @@ CONTENTS = {
     "without size": ([200, 201, 202], [], 0, 0.1),
     "without size, spread": ([200], [201, 202], 4, 0.1),
     "explores only": (range(20), [], 0, 1.0),
+    "explores alone": (range(0, 203, 7), [e for e in range(203) if e % 7], 8, 0.1),
 }
 PLACES = [(face, view) for face in (FLOOR, GLOSSY_FLOOR, METAL_FLOOR) for view in VIEWS]
 PLACES.append((ROOF, "above"))  # whence the sun is all there is
@@ -265,7 +281,7 @@ def lit_cache(explores_by="hierarchy"):
     """A frame, the LightCache of CONTENTS, and PLACES in each of its regions."""
     frame, _ = preprocessed(lit_scene(), gi.VisibilityLightCache(explores_by=explores_by))
     data = frame.lights.data
-    data.tables = table(CONTENTS.values())
+    data.tables = table(CONTENTS.values(), alone=[name == "explores alone" for name in CONTENTS])
     return frame, data, spots_in(np.arange(len(CONTENTS)))
 
 
@@ -312,6 +328,19 @@ def shares_of(data, spots):
     return shares[spots.regions.numpy()]
 
 
+def alone_at(data, spots):
+    """Bool [spot]: exploring selects the only light."""
+    return ((data.tables.buckets.numpy() == 0) | (data.tables.alone.numpy() != 0))[spots.regions.numpy()]
+
+
+def expected_times(frame, data, spots):
+    """Float64 [spot, emitter] how often each of the two choices selects a light."""
+    (_, offered), explores = probabilities(frame, data, spots), explored(frame, data, spots)
+    alone = alone_at(data, spots)[:, None]
+    share = shares_of(data, spots)[:, None]
+    return np.where(alone, explores, offered), np.where(alone, 0.0, share * explores)
+
+
 def contents_of(tables):
     """Of each region the emitters of its buckets, and the chance of each bucket."""
     out = []
@@ -335,9 +364,12 @@ def rates_of(tables):
 
 
 def choices(frame, data, spots, numbers, explores):
-    """Return emitters, pdfs, weights and flags [spot, number] of the cache's choices, or of those that explore."""
+    """Return emitters, pdfs, weights, flags (explores, alone) and `other` [spot, number].
+
+    Of the cache's choices, or of those that explore.
+    """
     shape = spots.faces.shape[0], len(numbers)
-    items, found = (wp.empty(shape, dtype=t, device=device()) for t in (wp.int32, wp.vec3))
+    items, found = (wp.empty(shape, dtype=t, device=device()) for t in (wp.int32, ChoiceWords))
     inputs = [data, frame.data, spots, int(explores), array(numbers, wp.vec3), items, found]
     launch(choose_lights, items.size, inputs, device())
     return items.numpy(), *np.moveaxis(found.numpy(), 2, 0)
@@ -401,8 +433,9 @@ def leaf_samples(counts, order, most):
     return grouped
 
 
-def records_of(lights, values):
+def records_of(lights, values, rivals=None):
     records = samples.SampleRecords()
+    records.rivals = array(np.zeros(len(lights)) if rivals is None else rivals, wp.float32)
     records.lights, records.light_values = array(lights, wp.uint32), array(values, wp.float32)
     return records
 
@@ -415,7 +448,9 @@ def deep_lesson(seed=3, count=20_000, lights=203):
     codes = (1 << 29) + (np.abs(rng.normal(size=count)) * 2.0 ** rng.integers(5, 26, count)).astype(np.int64)
     emitters = (rng.integers(0, 20, count) + codes // (1 << 20)) % lights
     records = records_of(
-        words(emitters, rng.choice(OUTCOMES, count, p=[0.1, 0.2, 0.5, 0.2]), rng), light_values(rng, count)
+        words(emitters, rng.choice(OUTCOMES, count, p=[0.1, 0.2, 0.3, 0.1, 0.2, 0.1]), rng),
+        light_values(rng, count),
+        rng.choice([-1.0, 0.0, 1e-3, 1.0, 30.0], count),
     )
     records.codes = array(codes, wp.uint32)
     for name in ("directions", "mixtures"):
@@ -427,7 +462,7 @@ def deep_lesson(seed=3, count=20_000, lights=203):
 def learnt_cache(explores_by):
     """A frame, the LightCache after two frames of learning, and PLACES in regions with the most buckets and the least.
 
-    Regions have eight lights a bucket; most know more.
+    Regions have eight lights a bucket; most know more. In two of them exploring is alone.
     """
     estimator = gi.VisibilityLightCache(explores_by=explores_by, capacity=8)
     _, state = preprocessed(lit_scene(), estimator)
@@ -437,6 +472,11 @@ def learnt_cache(explores_by):
     buckets = state.tables.buckets.numpy()
     assert buckets.max() >= 5
     leaves = np.concatenate([np.argsort(-buckets)[:6], [np.flatnonzero(buckets == n)[0] for n in (0, 1, 2)]])
+    alone = np.zeros(len(buckets), np.int32)
+    alone[leaves[[1, 8]]] = 1
+    tables = frame.lights.data.tables
+    tables.alone = array(alone)
+    frame.lights.data.tables = tables
     return frame, frame.lights.data, spots_in(leaves)
 
 
@@ -451,5 +491,5 @@ def random_cache(explores_by):
         full = [others[others % count == k][:32] for k in range(count)]
         contents.append((main, np.concatenate([*full, []]).astype(int), count, rng.choice([0.02, 0.1, 0.5, 0.75])))
     data = frame.lights.data
-    data.tables = table(contents)
+    data.tables = table(contents, alone=np.arange(len(contents)) == 3)
     return frame, data, spots_in(np.arange(len(contents)))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 from light_cache_tools import (
+    ALONE,
     BLOCKED,
     EXPLORED,
     ITEM,
@@ -53,6 +54,10 @@ LEAST_CHANCE = 0.02
 MOST_TRIES = 32
 FADING = 0.8
 PRICE = 0.1  # of exploring
+PROBED = 0.5  # of samples that explore alone, those that ask what the cache would do
+PAIR_MARGIN = 1.5
+LEARNT_TABLES = ("moments", "exploration", "excesses", "alone")
+SIGHTINGS = 3
 LARGEST = 1e15  # samples beyond say nothing
 MAIN = -1.0
 
@@ -315,6 +320,7 @@ def test_lights_that_matter_most(capacity):
 def settings_of(capacity=32, hysteresis=0.75, exploration=(0.1, 0.05, 0.75)):
     s = light_cache_build.CacheSettings()
     s.capacity, s.hysteresis = capacity, hysteresis
+    s.may_be_alone = int(exploration[1] < exploration[2])
     s.first_exploration, s.least_exploration, s.most_exploration = exploration
     return s
 
@@ -333,6 +339,7 @@ def bucketed(emitters, importances, before, capacity, tries=None):
     known = array(before[::-1])  # origins are in another order
     tables.buckets, sizes = (wp.empty(leaves, dtype=wp.int32, device=device()) for _ in range(2))
     tables.exploration = wp.full(leaves, 0.1, dtype=wp.float32, device=device())
+    tables.alone = wp.zeros(leaves, dtype=wp.int32, device=device())
     inputs = [settings, given, ranked, array(range(leaves)[::-1]), known, tables.buckets, sizes]
     launch(light_cache_build.count_buckets, leaves, inputs, device())
     numbers = sizes.numpy().copy()
@@ -441,32 +448,42 @@ def test_buckets_that_overflow_leave_lights_to_exploration(explores_by):
 # ---- how often lights are seen, and exploration that adapts ----
 
 
-def exploration_tables(moments, shares, buckets=None):
-    """CacheTables of regions that hold something, unless told."""
+def exploration_tables(moments, shares, buckets=None, alone=None, excesses=None):
+    """CacheTables of regions that hold something and where exploring is not alone, unless told."""
     tables = light_cache.CacheTables()
     tables.moments, tables.exploration = array(moments, wp.vec2), array(shares, wp.float32)
     tables.buckets = array(np.ones(len(shares)) if buckets is None else buckets)
+    tables.alone = array(np.zeros(len(shares)) if alone is None else alone)
+    tables.excesses = array(np.zeros(len(shares)) if excesses is None else excesses, wp.float32)
     return tables
 
 
 def weighed(settings, grouped, records, entries, tries, origins, known):
-    """Return the tries of each leaf's entries, and the moments and the shares of every leaf."""
+    """Return the tries of each leaf's entries, and of every leaf moments, shares, excesses, and where it is alone."""
     leaves, given = len(origins), lists(entries, tries)
-    tables = exploration_tables(np.full((leaves, 2), -7.0), np.full(leaves, -7.0))
+    tables = exploration_tables(np.full((leaves, 2), -7.0), np.full(leaves, -7.0), None, [-7] * leaves, [-7.0] * leaves)
     inputs = [settings, grouped, records, given, array(origins), known, tables]
     launch(light_cache_build.weigh_light_samples, leaves, inputs, device(), 16)
     assert entries_of(given) == entries
-    return tries_of(given), tables.moments.numpy(), tables.exploration.numpy()
+    return tries_of(given), *(getattr(tables, name).numpy() for name in LEARNT_TABLES)
 
 
 def expected_weights(settings, grouped, records, entries, tries, origins, known):
     """The same, one sample after another."""
     lights, values = records.lights.numpy(), records.light_values.numpy().astype(np.float64)
     starts, counts, order = (getattr(grouped, n).numpy().astype(np.int64) for n in ("starts", "counts", "order"))
-    tried, moments, shares = [], [], []
+    rivals = records.rivals.numpy().astype(np.float64)
+    tried, moments, shares, excesses, alone = [], [], [], [], []
     for leaf, origin in enumerate(origins):
         counted = {e >> 8: [float(x) for x in t] for e, t in zip(entries[leaf], tries[leaf], strict=True)}
+        moment, share, excess = np.zeros(2), settings.first_exploration, 0.0
+        is_alone = settings.may_be_alone
+        if origin >= 0:
+            moment, share = known.moments.numpy()[origin].astype(np.float64), float(known.exploration.numpy()[origin])
+            excess, is_alone = float(known.excesses.numpy()[origin]), int(known.alone.numpy()[origin])
         brought = {"offered": 0.0, "explored": 0.0}
+        gains, probes, pairs, last, parts, sightings = 0.0, 0, 0.0, 0.0, np.zeros(2), 0
+        both = np.zeros(3)
         looks = min(counts[leaf], grouped.most)
         for k in range(looks):
             slot = order[starts[leaf] + k * counts[leaf] // looks]
@@ -474,23 +491,51 @@ def expected_weights(settings, grouped, records, entries, tries, origins, known)
             emitter, seen = (word & ITEM) - 1, bool(word & VISIBLE)
             if word & EXPLORED:
                 brought["explored"] += square
+                gains += rivals[slot] if abs(rivals[slot]) < LARGEST**2 else 0.0
                 continue
-            brought["offered"] += square * seen
+            sightings += seen
+            if word & ALONE:
+                pairs += last * np.sqrt(square)
+                last = np.sqrt(square)
+                odds = rivals[slot]
+                probes += odds >= 0
+                if odds >= 0 and square > 0:
+                    # estimates of the two choices' second moments, with the power heuristic's weights
+                    own, other = odds**2 / (odds**2 + share**2), share**2 / (odds**2 + share**2)
+                    offered = square * own**2 / odds if odds > 0 else 0.0
+                    explored_too = square * other**2 / share
+                    brought["offered"] += offered / PROBED
+                    brought["explored"] += explored_too / PROBED * (share > odds)
+                    both += np.array([offered, explored_too, square]) / PROBED
+                    parts += np.array([own, other]) * values[slot]
+            else:
+                brought["offered"] += square * seen
+                gains += rivals[slot] if abs(rivals[slot]) < LARGEST**2 else 0.0
             if emitter in counted and (seen or word & BLOCKED):
                 counted[emitter][0] += seen
                 counted[emitter][1] += 1
-        moment, share = np.zeros(2), settings.first_exploration
-        if origin >= 0:
-            moment, share = known.moments.numpy()[origin].astype(np.float64), known.exploration.numpy()[origin]
-            if counts[leaf] > 0 and known.buckets.numpy()[origin] > 0:
-                moment = FADING * moment + (brought["offered"], brought["explored"] * share)
+        if origin >= 0 and counts[leaf] > 0:
+            if known.buckets.numpy()[origin] > 0:
+                unmet = (1 - FADING) * both[2] / max(probes, 1)  # as if one had found what the cache lacks
+                most = brought["offered"] + brought["explored"] * share
+                moment = FADING * moment + (brought["offered"], brought["explored"] * share + unmet)
+                both[1] += unmet / share
                 # as much as makes the noise of exploring a quarter of the rest's times the share
                 share = np.sqrt(moment[1] / max(PRICE * moment[0], 1e-30)) if moment[1] > 0 else 0.0
+                part = parts[0] / max(parts.sum(), 1e-30)
+                product = min(PAIR_MARGIN * part * (1 - part) * pairs, np.sqrt(both[0] * both[1]))
+                excess = FADING * excess + min(gains + both @ [1, 1, -1] + 2 * product, most)
+                if settings.may_be_alone and excess != 0:
+                    is_alone = int(excess > 0)
+            elif settings.may_be_alone:
+                is_alone = int(sightings < SIGHTINGS * len(entries[leaf]))
         moments.append(moment)
+        excesses.append(excess)
+        alone.append(is_alone)
         shares.append(np.clip(share, settings.least_exploration, settings.most_exploration))
         capped = [(n * min(1.0, MOST_TRIES / max(all_, 1)), min(all_, MOST_TRIES)) for n, all_ in counted.values()]
         tried.append(capped)
-    return tried, np.array(moments), np.array(shares)
+    return tried, np.array(moments), np.array(shares), np.array(excesses), np.array(alone)
 
 
 def check_weights(found, expected):
@@ -498,6 +543,10 @@ def check_weights(found, expected):
         assert np.allclose(here, wanted, rtol=1e-5, atol=1e-6)
     assert np.allclose(found[1], expected[1], rtol=1e-4, atol=0)
     assert np.allclose(found[2], expected[2], rtol=1e-4, atol=0)
+    slack = 1e-4 * (np.abs(expected[3]) + np.abs(expected[1]).max())  # of sums of both signs
+    assert (np.abs(found[3] - expected[3]) <= slack).all()
+    sure = np.abs(expected[3]) > slack
+    assert np.array_equal(found[4][sure], expected[4][sure]) and set(found[4]) <= {0, 1}
 
 
 LEARNT, FIXED = (0.15, 0.05, 0.75), (0.4, 0.4, 0.4)
@@ -515,10 +564,11 @@ def test_samples_are_weighed_as_one_by_one(most, exploration):
         counts = rng.choice([0, 1, 2, 40, 300], leaves)
         counts[:2] = 0
         total = counts.sum()
-        outcomes = rng.choice(OUTCOMES, total, p=[0.1, 0.3, 0.4, 0.2])
+        outcomes = rng.choice(OUTCOMES, total, p=[0.1, 0.2, 0.3, 0.1, 0.2, 0.1])
         leaf_of = np.repeat(np.arange(leaves), counts)
         outcomes[leaf_of % 5 == 3] &= VISIBLE  # nobody explored
-        outcomes[(leaf_of % 5 == 4) & (outcomes == VISIBLE)] = BLOCKED  # nobody saw anything but by exploring
+        only_explored = (leaf_of % 5 == 4) & ((outcomes & EXPLORED) == 0)
+        outcomes[only_explored] = BLOCKED  # nobody saw anything but by exploring
         values = light_values(rng, total) * np.where(outcomes & EXPLORED, 0.5, 1)
         values[rng.random(total) < 0.02] = 2e15
         order = rng.permutation(total)
@@ -526,7 +576,11 @@ def test_samples_are_weighed_as_one_by_one(most, exploration):
         lights[order] = words(rng.integers(-1, 40, total), outcomes, rng)
         by_slot = np.empty(total)
         by_slot[order] = values
-        records = records_of(lights, by_slot)
+        is_alone = (lights & ALONE) > 0
+        odds = rng.choice([-1.0, 0.0, 1e-3, 0.3, 40.0], total, p=[0.6, 0.1, 0.1, 0.1, 0.1])
+        rivals = np.where(is_alone, odds, rng.normal(size=total) * by_slot**2)
+        rivals[(by_slot > 1e15) & ~is_alone] = np.inf
+        records = records_of(lights, by_slot, np.float32(rivals))
         entries = [[int(e) << 8 | 2 for e in np.flatnonzero(rng.random(45) < rng.random())] for _ in range(leaves)]
         tries = [some_tries(rng, len(x)) for x in entries]
         origins = rng.integers(0, known.exploration.shape[0], leaves)
@@ -545,7 +599,7 @@ def test_samples_are_weighed_as_one_by_one(most, exploration):
         chosen += found[2].tolist()
         blocked += sum(t[1] - t[0] for x in found[0] for t in x) > 0
         tried += [t[1] for x in found[0] for t in x]
-        known = exploration_tables(found[1], found[2], rng.integers(0, 3, leaves))
+        known = exploration_tables(found[1], found[2], rng.integers(0, 3, leaves), found[4], found[3])
     assert blocked and {0, 1, MOST_TRIES} <= set(np.round(tried, 3)) and max(tried) < MOST_TRIES + 1e-3
     least, share, highest = np.float32(sorted(exploration))
     assert {least, share, highest} <= set(np.float32(chosen)) and (exploration is FIXED or len(set(chosen)) > 10)
@@ -602,7 +656,7 @@ def test_samples_that_say_nothing_of_exploration(light, value, buckets, expected
     given = [[[]] * 3, [[]] * 3, np.array([0, 1, -1]), known]
     settings = settings_of(exploration=LEARNT)
     grouped, records = leaf_samples([5, 5, 5], range(15), 9), records_of([light] * 15, [value] * 15)
-    _, moments, shares = weighed(settings, grouped, records, *given)
+    _, moments, shares, *_ = weighed(settings, grouped, records, *given)
     assert np.allclose(moments, expected)
     by_moments = [0.05, np.sqrt(0.1 / 9 / PRICE), 0.15]  # as little as may be, where nothing was found
     assert np.allclose(shares, by_moments if buckets else [0.33, 0.4, 0.15])
@@ -629,14 +683,16 @@ def learnt_exploration(contents, unseen=(), frames=3):
         regions.records = records_of(np.zeros(places * count), np.zeros(places * count))
         for explores in (0, 1):
             numbers = rng.random((count, 3)).astype(np.float32)
-            items, pdfs, weights, _ = choices(frame, data, spots, numbers, explores)
+            items, pdfs, weights, *_, others = choices(frame, data, spots, numbers, explores)
             there = items >= 0
             values = np.where(there, weights * light[np.arange(places)[:, None], items] / np.where(there, pdfs, 1), 0.0)
             arrives = np.where(values > 0, 1, -1)
-            given = [array(items.ravel()), explores, array(arrives.ravel()), array(values.ravel(), wp.float32)]
+            chances = np.stack([pdfs, weights, others], axis=-1).reshape(-1, 3)
+            given = [array(items.ravel()), explores, array(np.zeros(items.size)), array(chances, wp.vec3)]
+            given += [array(arrives.ravel()), array(values.ravel(), wp.float32)]
             launch(keep_lights, items.size, [regions, *given], device())
         inputs = [settings_of(), grouped, regions.records, nothing, nothing, np.arange(places), known]
-        _, moments, shares = weighed(*inputs)
+        _, moments, shares, *_ = weighed(*inputs)
         known = exploration_tables(moments, shares)
     return shares[light.sum(axis=1) > 0], light
 
@@ -682,7 +738,10 @@ def test_a_region_knows_what_it_and_its_neighbours_saw():
         learnt = expected_weights(*given)
         state = estimator.learn(lesson, state)
         assert entries_of(state.known) == expected
-        found = [tries_of(state.known), state.tables.moments.numpy(), state.tables.exploration.numpy()]
+        found = [
+            tries_of(state.known),
+            *(getattr(state.tables, n).numpy() for n in LEARNT_TABLES),
+        ]
         check_weights(found, learnt)
         tries = found[0]
         importances, rates = importances_of(frame.lights.data, cells_of(lesson)), rates_of(state.tables)
@@ -741,7 +800,7 @@ def test_threads_do_not_matter():
                     used,
                     rates_of(t),
                     tries_of(state.known),
-                    *(x.numpy().tolist() for x in (t.buckets, t.offsets, t.exploration, t.moments)),
+                    *(getattr(t, name).numpy().tolist() for name in ("buckets", "offsets", *LEARNT_TABLES)),
                 )
             )
     finally:

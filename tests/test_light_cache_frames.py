@@ -10,6 +10,7 @@ import pytest
 import statistics_tools as st
 import warp as wp
 from light_cache_tools import (
+    ALONE,
     BLOCKED,
     EXPLORED,
     GLOSSY,
@@ -223,22 +224,39 @@ def test_kept_lights():
     items[rng.random((2, count)) < 0.3] = -1
     values = np.where(arrives > 0, rng.random((2, count)), 0.0)
     glossy = np.where(rng.random(count) < 0.3, GLOSSY, 0)
+    chances = np.float32(rng.uniform(0.1, 1, (2, count, 3)))  # pdf, weight, other
+    chances[0, :100, 2] = -1.0  # where exploring is alone: unknown
+    alone = np.zeros((2, count), int)
+    alone[0, :200] = 1
+    items[1, :200] = -1
     regions = samples.SampleRegions()
     regions.records = records_of(glossy, np.full(count, -3.0))
     for k in range(2):
-        given = [array(items[k]), k, array(arrives[k]), array(values[k], wp.float32)]
+        given = [array(items[k]), k, array(alone[k]), array(chances[k], wp.vec3)]
+        given += [array(arrives[k]), array(values[k], wp.float32)]
         launch(keep_lights, count, [regions, *given], device())
     found, kept = regions.records, []
     lights, brought = found.lights.numpy().astype(np.int64), found.light_values.numpy()
+    rivals = found.rivals.numpy()
     for slot in range(count):
         expected = 0, -3.0  # as it was
         if items[1, slot] >= 0 and arrives[1, slot] == 1:
             expected = int(items[1, slot]) + 1 | EXPLORED | VISIBLE, values[1, slot]
         elif items[0, slot] >= 0:
-            expected = int(items[0, slot]) + 1 | {1: VISIBLE, 0: 0, -1: BLOCKED}[arrives[0, slot]], values[0, slot]
+            word = int(items[0, slot]) + 1 | {1: VISIBLE, 0: 0, -1: BLOCKED}[arrives[0, slot]] | ALONE * alone[0, slot]
+            expected = word, values[0, slot]
         assert (lights[slot], brought[slot]) == (expected[0] | glossy[slot], np.float32(expected[1])), slot
         kept.append(expected[0] & ~ITEM)
-    assert set(kept) == {0, VISIBLE, BLOCKED, VISIBLE | EXPLORED}
+        rival = 0.0  # how much the sum of squares of both exceeds what exploring alone would bring
+        if alone[0, slot]:
+            rival = chances[0, slot, 2] / chances[0, slot, 0] if items[0, slot] >= 0 else 0.0
+        else:
+            light_of = np.where((items[:, slot] >= 0) & (arrives[:, slot] == 1), values[:, slot], 0.0)
+            pdf, weight, other = chances[:, slot].astype(float).T
+            # that would have brought pdf / (weight * other) as much, and found it as much more rarely
+            rival = light_of.sum() ** 2 - (light_of**2 * pdf / (weight * other)).sum()
+        assert np.isclose(rivals[slot], rival, rtol=1e-4, atol=1e-4), slot
+    assert set(kept) == {0, VISIBLE, BLOCKED, VISIBLE | EXPLORED, ALONE, VISIBLE | ALONE, BLOCKED | ALONE}
 
 
 def test_connections_say_what_is_in_between():
@@ -315,16 +333,16 @@ def test_samples_remember_what_they_brought_to_the_picture(exploration):
         codes, words_kept, values = watched[-1]
         there = (codes != 0xFFFFFFFF) & ((words_kept & ITEM) > 0)
         word, value = words_kept[there], values[there]
-        seen, blocked, explored = ((word & flag) > 0 for flag in (VISIBLE, BLOCKED, EXPLORED))
+        seen, blocked, explored, alone = ((word & flag) > 0 for flag in (VISIBLE, BLOCKED, EXPLORED, ALONE))
         assert (value[seen] > 0).all() and (value[~seen] == 0).all() and not (seen & blocked).any()
         assert seen[explored].all()
         assert indirect.sum() > 0.03 * direct.sum()
         share = value.sum() / 4 / ((direct + indirect) @ LUMINANCE).sum()
         if index == 0:  # nothing is known
-            assert explored.all() and np.isclose(share, 1, rtol=1e-3)
+            assert alone.all() and not explored.any() and np.isclose(share, 1, rtol=1e-3)
         elif exploration < 0.1:
             assert not explored.any() and np.isclose(share, 1, rtol=1e-3)
-            assert 0.01 < blocked.mean() < seen.mean()
+            assert 0.01 < blocked.mean() < seen.mean() and not alone.any()
         else:
             # the cache offers nearly all lights by now, and then its sample is the one to keep
             assert explored.mean() < 0.1 and 0.5 < share < 0.999 and blocked.any() and (seen & ~explored).any()
@@ -354,13 +372,18 @@ def test_paths_weigh_both_samples(sort):
     for index, frame in enumerate(gi.render(scene, camera, pipeline, frames=range(3), device=str(device()))):
         codes, words_kept, values = watched[-1]
         there = codes != 0xFFFFFFFF
-        explored, values = (words_kept[there] & EXPLORED) > 0, values[there]
+        explored, alone = ((words_kept[there] & flag) > 0 for flag in (EXPLORED, ALONE))
+        values = values[there]
         assert len(values) == 4 * SIZE[0] * SIZE[1]
         if index == 0:  # nothing is known
             whole = values.mean()
-            assert explored.all() and np.allclose(frame.numpy("emitters") @ LUMINANCE, whole, rtol=noise)
+            assert (
+                alone.all()
+                and not explored.any()
+                and np.allclose(frame.numpy("emitters") @ LUMINANCE, whole, rtol=noise)
+            )
         else:  # the cache's sample is kept, and four pixels' samples explored zero to four times
-            assert not explored.any() and np.allclose(values, whole / (1.0 + share**2), rtol=noise)
+            assert not (explored | alone).any() and np.allclose(values, whole / (1.0 + share**2), rtol=noise)
             counted = (frame.numpy("emitters") @ LUMINANCE / whole * (1.0 + share**2) - 1.0) / share * 4
             assert np.abs(counted - counted.round()).max() < 20 * noise
             assert set(counted.round().ravel()) == {0, 1, 2, 3, 4} and abs(counted.mean() - 2) < 0.2

@@ -30,7 +30,7 @@ class SampleOctree:
     collapse: int = 512
     """Samples of a frame below which an inner node becomes a leaf."""
     most_samples: int = 1 << 20
-    """Samples that are kept of a frame at most, 36 bytes each; of more paths, every second, third ... is recorded."""
+    """Samples that are kept of a frame at most, 40 bytes each; of more paths, every second, third ... is recorded."""
 
     def __post_init__(self) -> None:
         for name, least in (("split", 1), ("collapse", 1), ("most_samples", 1024)):
@@ -60,7 +60,7 @@ class SampleOctree:
         else:
             for name in ("codes", "lights", "directions", "mixtures"):
                 setattr(records, name, wp.empty(slots, dtype=wp.uint32, device=frame.device))
-            for name in ("light_values", "contributions", "pdfs", "nearness", "carried"):
+            for name in ("light_values", "rivals", "contributions", "pdfs", "nearness", "carried"):
                 setattr(records, name, wp.empty(slots, dtype=wp.float32, device=frame.device))
         records.codes.fill_(0xFFFFFFFF)
         records.vertices, records.stride, records.seed = vertices, stride, frame.seed

@@ -29,7 +29,8 @@ class VisibilityLightCache(Estimator):
 
     Lights are selected by what they reflect at the very point: the closed-form cosine integral of their triangle, and
     linearly transformed cosines for GGX; and by how often they are seen. With a share of samples another light is
-    explored. Unbiased. Every path vertex uses it.
+    explored. Where a region's points see more lights than its cache can hold, as under a wall of thousands of equal
+    ones, it learns that selecting by the hierarchy alone varies less, and does so. Unbiased. Every path vertex uses it.
     """
 
     term: ClassVar[str] = "emitters"
@@ -40,7 +41,8 @@ class VisibilityLightCache(Estimator):
     """Share of samples that also explore, in (0, 1): the first one, and the only one unless ``adapts_exploration``; at
     least 0.3 then in frames in which a light moves."""
     adapts_exploration: bool = True
-    """Whether each region learns the share, from 0.05 to 0.75: by what exploring brings of what varies."""
+    """Whether each region learns the share, from 0.05 to 0.75: by what exploring brings of what varies; and where only
+    to explore, without a sample of the cache, varies less than both together."""
     memory: int = 8
     """Frames that a light stays in a region after it was last seen, 0 to 200."""
     explores_by: str = "hierarchy"
@@ -96,7 +98,7 @@ class VisibilityLightCache(Estimator):
         places, areas = _places(scene.data(device))
         radiances = scene.emitter_powers() / (np.pi * np.maximum(areas, 1e-30)) * (areas > 0)
         luminances = launch.on_device(radiances.astype(np.float32), wp.float32, device)
-        return CacheState(_tables(8, device, self.exploration), _lists(8, device), places, tree, luminances)
+        return CacheState(self._tables(8, device), _lists(8, device), places, tree, luminances)
 
     def preprocess(self, frame: Any, state: CacheState | None) -> CacheState | None:
         """Bring the shapes of lights and the table of exploration up to the frame, and give paths the cache."""
@@ -128,6 +130,20 @@ class VisibilityLightCache(Estimator):
         frame.lights = SamplerInUse(light_cache.CACHED_LIGHTS, cache)
         return state
 
+    def _tables(self, leaves: int, device: wp.Device) -> light_cache.CacheTables:
+        """Return tables of regions that know nothing."""
+        tables = light_cache.CacheTables()
+        for name in ("buckets", "offsets"):
+            setattr(tables, name, wp.zeros(leaves, dtype=wp.int32, device=device))
+        tables.items = wp.zeros(0, dtype=wp.int32, device=device)
+        tables.rates = wp.zeros(0, dtype=wp.float32, device=device)
+        tables.chances = wp.zeros(0, dtype=wp.float32, device=device)
+        tables.exploration = wp.full(leaves, self.exploration, dtype=wp.float32, device=device)
+        tables.alone = wp.full(leaves, int(self.adapts_exploration), dtype=wp.int32, device=device)
+        tables.moments = wp.zeros(leaves, dtype=wp.vec2, device=device)
+        tables.excesses = wp.zeros(leaves, dtype=wp.float32, device=device)
+        return tables
+
     def _table(self, frame: Any, moved: np.ndarray, centers: np.ndarray) -> np.ndarray:
         """Return the relative probabilities of exploring each light (section 4.3)."""
         powers = frame.scene.emitter_powers()
@@ -154,6 +170,7 @@ class VisibilityLightCache(Estimator):
         settings.first_exploration = self.exploration
         adapted = (LEAST_EXPLORATION, MOST_EXPLORATION) if self.adapts_exploration else (self.exploration,) * 2
         settings.least_exploration, settings.most_exploration = adapted
+        settings.may_be_alone = int(self.adapts_exploration)
         samples, origins = lesson.leaf_samples(self.samples), lesson.origins
 
         seen = _lists(leaves, device)
@@ -166,7 +183,10 @@ class VisibilityLightCache(Estimator):
         joined.entries = wp.zeros(size, dtype=wp.int32, device=device)
         joined.tries = wp.zeros(size, dtype=wp.vec2, device=device)
         lesson.launch(light_cache_build.join_lights, [*around, joined, self.memory])
-        tables, sizes = _tables(leaves, device, self.exploration), wp.empty(leaves, dtype=wp.int32, device=device)
+        tables, sizes = (
+            self._tables(leaves, device),
+            wp.empty(leaves, dtype=wp.int32, device=device),
+        )
         inputs = [settings, samples, lesson.records, joined, origins, state.tables, tables]
         lesson.launch(light_cache_build.weigh_light_samples, inputs)
 
@@ -204,18 +224,6 @@ class CacheState:
     """LightShape [emitter]; None before the first frame."""
     emitters: wp.array | None = field(default=None, metadata={"derived": True})
     """Emitter [emitter] of the scene; None before the first frame."""
-
-
-def _tables(leaves: int, device: wp.Device, exploration: float) -> light_cache.CacheTables:
-    tables = light_cache.CacheTables()
-    tables.buckets = wp.zeros(leaves, dtype=wp.int32, device=device)
-    tables.offsets = wp.zeros(leaves, dtype=wp.int32, device=device)
-    tables.items = wp.zeros(0, dtype=wp.int32, device=device)
-    tables.rates = wp.zeros(0, dtype=wp.float32, device=device)
-    tables.chances = wp.zeros(0, dtype=wp.float32, device=device)
-    tables.exploration = wp.full(leaves, exploration, dtype=wp.float32, device=device)
-    tables.moments = wp.zeros(leaves, dtype=wp.vec2, device=device)
-    return tables
 
 
 def _lists(leaves: int, device: wp.Device) -> light_cache_build.LightLists:
