@@ -14,7 +14,7 @@ import tyro
 from warp_gi import launch
 from warp_gi.baking import Bake
 from warp_gi.camera import Camera, CameraPath
-from warp_gi.cli_inputs import DEFAULT_SCENE, SceneOptions, find_camera, find_scene, parse_resolution
+from warp_gi.cli_inputs import DEFAULT_SCENE, SceneOptions, find_camera, find_scene, has_camera, parse_resolution
 from warp_gi.cli_options import flag, parse_options
 from warp_gi.cli_report import Reporter, start_warp
 from warp_gi.cli_techniques import DEFAULT_TECHNIQUE, TECHNIQUES, Settings, technique_of
@@ -108,7 +108,8 @@ def run(options: BakeOptions, report: Reporter) -> None:
     resolution = parse_resolution(options.picture) if options.picture else None
     with report.phase("scene"):
         scene = find_scene(options)
-        camera = find_camera(options, scene, report) if technique.is_of_view or options.show is not None else None
+        is_of_view = technique.is_of_view and not (technique.bakes_unseen and not has_camera(options, scene))
+        camera = find_camera(options, scene, report) if is_of_view or options.show is not None else None
     if resolution and camera is not None:
         camera = camera.at_resolution(*resolution)
     report.line(f"{scene.name}: {scene.triangle_count:,} triangles")
@@ -127,7 +128,7 @@ def run(options: BakeOptions, report: Reporter) -> None:
             options.settings,
             options.device,
             options.seed,
-            camera if technique.is_of_view and not options.everywhere else None,
+            camera if is_of_view and not options.everywhere else None,
             lambda stage, share: tell(share),
         )
     compiled = launch.compile_seconds - compiled

@@ -130,6 +130,12 @@ def find_camera(options: SceneOptions, scene: Scene, report: Reporter) -> Camera
     return camera
 
 
+def has_camera(options: SceneOptions, scene: Scene) -> bool:
+    """Return whether a camera was asked for, or the scene brings one: else ``find_camera`` shows it from outside."""
+    name = options.scene or DEFAULT_SCENE
+    return bool(options.camera or options.eye is not None or scene.cameras or name in BUILTIN_SCENES)
+
+
 def scene_camera(scene: Scene, name: str) -> Camera | CameraPath:
     """Return a camera of the scene; its path if it moves with a node."""
     path = CameraPath.from_scene(scene, name)

@@ -35,6 +35,8 @@ class Technique:
     """What files of an export are called."""
     is_of_view: bool
     """Whether it bakes no more than the camera sees, unless told otherwise."""
+    bakes_unseen: bool
+    """Whether it finds out by itself what to bake of a scene that has no camera."""
     check: Callable[[Any, bool], None]
     """Given the settings and whether --everywhere was, raises OptionError for what makes no sense."""
     check_scene: Callable[[Any, Scene], None]
@@ -158,6 +160,7 @@ TECHNIQUES = {
         short_name="dvf",
         exported="textures",
         is_of_view=True,
+        bakes_unseen=False,
         check=_check_field,
         check_scene=lambda settings, scene: settings.bake_settings(scene),  # raises for a grid that is too fine
         check_export_name=visibility_export.check_export_name,
@@ -171,6 +174,7 @@ TECHNIQUES = {
         short_name="probes",
         exported="atlases",
         is_of_view=True,
+        bakes_unseen=True,
         check=_check_probes,
         check_scene=_check_grid,
         check_export_name=light_field_export.check_export_name,
