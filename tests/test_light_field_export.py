@@ -196,7 +196,7 @@ def shown(scene, bake, tmp_path_factory):
 
 def test_sheets_show_the_maps(bake, shown):
     _, images = shown
-    assert set(images) == {"radiance", "distance", "normal", "irradiance", "places", "ray"}
+    assert set(images) == {"radiance", "distance", "normal", "irradiance", "places", "seen", "ray"}
     exposure = exposure_of(bake.arrays["irradiance"].astype(np.float64) / np.pi)
     makers = export.probe_maps(bake)
     columns = pictures._sheet_columns(3, 18)
