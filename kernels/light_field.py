@@ -39,9 +39,7 @@ class LightField:
     resolution: wp.int32  # texels along a side of a map, a multiple of BLOCK
     irradiance_resolution: wp.int32
     bias: wp.float32  # metres along the normal by which points leave their surface before visibility is asked for
-    least_seen: (
-        wp.float32
-    )  # share of the weights around a point that probes which see it need, or its light is not known
+    least_seen: wp.float32  # share of the weights around a point that probes which see it have, or nothing is known
     plain: wp.int32  # 1: interpolate as if every probe saw every point, as irradiance probes did before the paper
     bounds_low: wp.vec3  # of the scene: a ray that leaves them meets nothing any more
     bounds_high: wp.vec3

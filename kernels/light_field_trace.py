@@ -58,6 +58,7 @@ RAYS_GEOMETRY = wp.constant(0)
 RAYS_PROBES = wp.constant(1)
 VISIBILITY_PROBES = wp.constant(0)
 VISIBILITY_EXACT = wp.constant(1)
+IN_SIGHT = wp.constant(wp.float32(0.3))  # by the maps, whose bounds are kind to what is hidden
 LOBE_DIMENSION = wp.constant(2000)  # dimension pairs that no path gets to
 DIRECTION_DIMENSION = wp.constant(2001)
 
@@ -104,7 +105,8 @@ class ProbeView:
 @wp.struct
 class SeenLight:
     irradiance: wp.vec3  # W/m^2, by reflected light
-    probes: wp.int32  # that see the point; 0: none does, and nothing is known
+    probes: wp.int32  # in front of the surface that see the point
+    known: wp.int32  # 1: enough of them do; 0: nothing is known
 
 
 # The irradiance between the probes that see a point with a unit normal, by their maps or by shadow rays.
@@ -125,20 +127,20 @@ def seen_light(
         probe = cage_probe(field, cage, corner)
         weight = blend_weight(field, cage, corner, at, position, normal)
         around += weight
+        sight = float(0.0)
         if weight > 0.0:
-            if visibility == VISIBILITY_EXACT:
-                if bvh_occluded(scene.bvh, origin, field.positions[probe] - origin, 1.0):
-                    weight = 0.0
-            else:
-                weight = weight * map_visibility(field, probe, position, normal)
-        if weight > 0.0:
-            r.irradiance = r.irradiance + probe_irradiance(field, probe, uv) * weight
-            weights = weights + weight
+            if visibility == VISIBILITY_PROBES:
+                sight = map_visibility(field, probe, position, normal)
+            elif not bvh_occluded(scene.bvh, origin, field.positions[probe] - origin, 1.0):
+                sight = 1.0
+        if sight > 0.0:
+            r.irradiance = r.irradiance + probe_irradiance(field, probe, uv) * (weight * sight)
+            weights = weights + weight * sight
+        if sight >= IN_SIGHT and wp.dot(field.positions[probe] - position, normal) > 0.0:
             r.probes += 1
-    if weights <= around * field.least_seen:
-        r.probes = 0
-    elif weights > 0.0:
+    if weights > around * field.least_seen:
         r.irradiance = r.irradiance / weights
+        r.known = 1
     return r
 
 
@@ -223,7 +225,7 @@ def reflected_light(
         normal = shading_normal(s)
         seen = seen_light(scene, field, query.visibility, s.position, normal, ray_origin(s))
         paths.terms = TERM_ENVIRONMENT | TERM_EMITTERS
-        if seen.probes > 0:
+        if seen.known != 0:
             known = wp.cw_mul(average_reflectance(s.bsdf), seen.irradiance) / wp.pi
         else:
             paths.terms = TERM_ENVIRONMENT | TERM_EMITTERS | TERM_INDIRECT
@@ -305,10 +307,10 @@ def trace_probes(
     towards = -hits.direction[pixel]
     s = surface_at(scene, hit.face, hit.u, hit.v, towards)
     seen = SeenLight()
-    seen.probes = 1
+    seen.known = 1
     if query.mode != MODE_TRACED and (query.mode == MODE_IRRADIANCE or wp.max(s.bsdf.diffuse) > 0.0):
         seen = seen_light(scene, field, query.visibility, s.position, shading_normal(s), ray_origin(s))
-    by_path = seen.probes == 0
+    by_path = seen.known == 0
     steady = steady_light(seen.irradiance, s, query.mode)
     numbers = ray_numbers(query, s, by_path)
     rays = numbers[0]
@@ -343,7 +345,8 @@ def trace_probes(
         buffers.glossy[pixel] = buffers.glossy[pixel] + glossy * share
 
 
-# Thread: a pixel of a first hit. How many of the probes around it see it, 0 to 8; -1 where nothing was hit.
+# Thread: a pixel of a first hit. How many of the probes around it see it, 1 to 8; 0 where paths are traced, -1 where
+# nothing was hit.
 @wp.kernel
 def count_probes(
     first: wp.int32,
@@ -358,7 +361,7 @@ def count_probes(
     if hits.face[pixel] >= 0:
         s = surface_at(scene, hits.face[pixel], hits.u[pixel], hits.v[pixel], -hits.direction[pixel])
         seen = seen_light(scene, field, visibility, s.position, shading_normal(s), ray_origin(s))
-        counts[pixel] = seen.probes
+        counts[pixel] = wp.where(seen.known != 0, seen.probes, 0)
 
 
 # What the sky sends against a direction, from the first probe that sees it there.

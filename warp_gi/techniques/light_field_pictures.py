@@ -226,7 +226,7 @@ def probes_in_sight(frame: Frame, state: Any) -> np.ndarray:
 def draw_seen(frame: Frame, state: Any) -> np.ndarray:
     """Return ``probes_in_sight`` in colours, shaded as the frame is, uint8 [height + legend, width, 3]."""
     counts = probes_in_sight(frame, state)
-    colors = np.concatenate([[UNSEEN_COLOR], magma(np.arange(1, 9) / 9)]).astype(np.uint8)
+    colors = np.concatenate([[UNSEEN_COLOR], magma(np.arange(1, 9)[None] / 9)[0]]).astype(np.uint8)
     shade = tone_map(frame.numpy("beauty"), exposure_of(frame.numpy("beauty"))).mean(axis=-1, keepdims=True) / 255
     image = colors[np.maximum(counts, 0)] * (0.55 + 0.45 * shade)
     image[counts < 0] = 255
