@@ -104,7 +104,7 @@ class ProbeView:
 # What probes say of the light at a point.
 @wp.struct
 class SeenLight:
-    irradiance: wp.vec3  # W/m^2, by reflected light
+    irradiance: wp.vec3  # W/m^2, by reflected light; 0 where nothing is known
     probes: wp.int32  # in front of the surface that see the point
     known: wp.int32  # 1: enough of them do; 0: nothing is known
 
@@ -138,9 +138,11 @@ def seen_light(
             weights = weights + weight * sight
         if sight >= IN_SIGHT and wp.dot(field.positions[probe] - position, normal) > 0.0:
             r.probes += 1
-    if weights > around * field.least_seen:
-        r.irradiance = r.irradiance / weights
-        r.known = 1
+    if weights <= around * field.least_seen:
+        r.irradiance = wp.vec3(0.0, 0.0, 0.0)
+        return r
+    r.irradiance = r.irradiance / weights
+    r.known = 1
     return r
 
 

@@ -81,5 +81,6 @@ def run_case(file: str, case: str, *more: str, seconds: float = 90.0) -> None:
 
 def main(*cases: Callable[..., None]) -> None:
     """Run the case that the command line names; say where it is if it takes a minute."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs start with it ignored
     faulthandler.dump_traceback_later(60)
     {case.__name__: case for case in cases}[sys.argv[1]](*sys.argv[2:])

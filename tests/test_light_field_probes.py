@@ -18,6 +18,7 @@ from warp_gi.kernels import light_field_trace as trace_kernels
 from warp_gi.kernels.bsdf import bsdf_sample, make_bsdf
 from warp_gi.kernels.sampling import sample_1d, sample_2d
 from warp_gi.kernels.surface import Surface
+from warp_gi.techniques import light_field_state
 from warp_gi.techniques.light_field_export import unpack_radiance
 from warp_gi.techniques.light_field_pictures import draw_seen, probes_in_sight
 from warp_gi.techniques.light_field_places import (
@@ -456,6 +457,15 @@ def test_paths_are_traced_where_no_probe_sees(mode):
     assert gi.metrics.rmse(unseen, truth) < 0.2 * truth.mean()
     with pytest.warns(UserWarning, match="is of no camera"):
         indirect(scene, there, bakes=[gi.bake(scene, gi.LightFieldProbes(**settings))], **settings)
+
+
+@pytest.mark.parametrize("mode", ["irradiance", "hybrid"])
+def test_where_too_few_probes_see_a_path_is_all_of_the_light(monkeypatch, mode):
+    """What these few know is not added to it: the picture is that of the path tracer with the same seed."""
+    monkeypatch.setattr(light_field_state, "LEAST_SEEN", 2.0)  # more than all of them together
+    scene = lamp_room()
+    truth = gi.FrameScheduler(scene, view(), gi.Pipeline(environment=None, emitters=None, spp=4), seed=1).frame(0)
+    np.testing.assert_allclose(indirect(scene, spp=4, mode=mode, **SMALL), truth.numpy("indirect"), rtol=1e-5)
 
 
 def test_nothing_is_black_under_a_stair_that_no_probe_looks_under():

@@ -212,6 +212,22 @@ def test_frames_wait_while_the_lock_is_held():
     assert not workers._open
 
 
+def test_a_bake_looks_for_edits_when_it_has_the_scene():
+    """What another thread edits while it holds the lock, and undoes, is none."""
+    scene = moving_room()
+    scene.data("cpu")
+    points, found = scene.nodes[0].meshes[0].points, []
+    thread = threading.Thread(target=lambda: found.append(gi.bake(scene, FIELD, camera_path=still_path(scene))))
+    with scene.lock:
+        points[0, 0] += 1.0
+        thread.start()
+        thread.join(0.3)
+        assert thread.is_alive()
+        points[0, 0] -= 1.0
+    thread.join()
+    assert len(found) == 1
+
+
 if __name__ == "__main__":
     launch.set_threads(2)
     main(two_threads_one_scene, bake_beside_frames, edits_beside_frames, other_thread_counts_beside_launches)

@@ -589,9 +589,9 @@ def bake(
     Raises OptionError for a device that is not there, or an estimator that has nothing to bake, SceneError for a
     scene that was edited after it was built.
     """
-    scene.check_unchanged()
     told = (lambda share: progress("bake", share)) if progress else None
     with scene.lock:
+        scene.check_unchanged()
         scene.update(0.0, None, device)
         result = estimator.bake(scene, device, seed, told, camera_path)
     if result is None:
