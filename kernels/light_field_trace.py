@@ -44,7 +44,7 @@ from warp_gi.kernels.path_trace import (
     PathSettings,
     trace_path,
 )
-from warp_gi.kernels.sampling import pixel_sample_index, pixel_seed, sample_1d, sample_2d
+from warp_gi.kernels.sampling import pixel_sample_index, pixel_seed, random_1d, sample_1d, sample_2d
 from warp_gi.kernels.surface import Surface, ray_origin, shading_normal, surface_at
 from warp_gi.kernels.types import SceneData
 
@@ -61,6 +61,8 @@ VISIBILITY_EXACT = wp.constant(1)
 IN_SIGHT = wp.constant(wp.float32(0.3))  # by the maps, whose bounds are kind to what is hidden
 LOBE_DIMENSION = wp.constant(2000)  # dimension pairs that no path gets to
 DIRECTION_DIMENSION = wp.constant(2001)
+PATH_DIMENSION = wp.constant(2002)
+HIT_DIMENSION = wp.constant(2003)
 
 
 @wp.struct
@@ -106,7 +108,7 @@ class ProbeView:
 class SeenLight:
     irradiance: wp.vec3  # W/m^2, by reflected light; 0 where nothing is known
     probes: wp.int32  # in front of the surface that see the point
-    known: wp.int32  # 1: enough of them do; 0: nothing is known
+    trust: wp.float32  # 1 where enough of them do, 0 where none does
 
 
 # The irradiance between the probes that see a point with a unit normal, by their maps or by shadow rays.
@@ -138,11 +140,10 @@ def seen_light(
             weights = weights + weight * sight
         if sight >= IN_SIGHT and wp.dot(field.positions[probe] - position, normal) > 0.0:
             r.probes += 1
-    if weights <= around * field.least_seen:
-        r.irradiance = wp.vec3(0.0, 0.0, 0.0)
+    if weights <= 0.0:
         return r
     r.irradiance = r.irradiance / weights
-    r.known = 1
+    r.trust = wp.min(weights / (around * field.least_seen), 1.0)
     return r
 
 
@@ -205,8 +206,15 @@ def lobes_of(s: Surface, wo: wp.vec3, sample: BsdfSample, light: wp.vec3, mode: 
     return r
 
 
+# Whether a sample goes by the probes at a point, or by a path: by a random number, so that there is no edge between
+# where they are trusted and where they are not.
+@wp.func
+def trusts(seen: SeenLight, index: wp.uint32, seed: wp.uint32, dimension: wp.int32) -> wp.bool:
+    return seen.trust >= 1.0 or random_1d(index, seed, dimension) < seen.trust
+
+
 # What a surface that a ray meets reflects against the ray: its direct light, sampled, and what the probes know; or a
-# path goes on from there. `by_path` is 1 for the first hit of a camera ray, where a path stands for all of the term.
+# path goes on from there. `by_path` is true for the first hit of a camera ray, where a path stands for all of the term.
 @wp.func
 def reflected_light(
     scene: SceneData,
@@ -227,7 +235,7 @@ def reflected_light(
         normal = shading_normal(s)
         seen = seen_light(scene, field, query.visibility, s.position, normal, ray_origin(s))
         paths.terms = TERM_ENVIRONMENT | TERM_EMITTERS
-        if seen.known != 0:
+        if trusts(seen, index, seed, HIT_DIMENSION):
             known = wp.cw_mul(average_reflectance(s.bsdf), seen.irradiance) / wp.pi
         else:
             paths.terms = TERM_ENVIRONMENT | TERM_EMITTERS | TERM_INDIRECT
@@ -271,14 +279,24 @@ def ray_light(
     return lobes_of(s, wo, sample, light, query.mode)
 
 
+@wp.func
+def primary_hit(hits: PrimaryHits, pixel: wp.int32) -> BvhHit:
+    hit = BvhHit()
+    hit.face = hits.face[pixel]
+    hit.t = hits.t[pixel]
+    hit.u = hits.u[pixel]
+    hit.v = hits.v[pixel]
+    return hit
+
+
 # Rays of a pixel in the current camera sample, the first of them, and the bits that count those of the pixel.
 @wp.func
-def ray_numbers(query: ProbeQuery, s: Surface, by_path: wp.bool) -> wp.vec3i:
+def ray_numbers(query: ProbeQuery, s: Surface, may_trace_paths: wp.bool) -> wp.vec3i:
     if query.mode == MODE_IRRADIANCE:
-        if by_path:
+        if may_trace_paths:
             return wp.vec3i(query.samples, query.first_sample, query.sample_bits)
         return wp.vec3i(0, query.first_ray, query.ray_bits)
-    if query.mode == MODE_HYBRID and s.bsdf.f90 <= 0.0 and not by_path:
+    if query.mode == MODE_HYBRID and s.bsdf.f90 <= 0.0 and not may_trace_paths:
         return wp.vec3i(0, query.first_ray, query.ray_bits)
     return wp.vec3i(query.rays, query.first_ray, query.ray_bits)
 
@@ -299,23 +317,19 @@ def trace_probes(
     if p[0] >= camera.width or p[1] >= camera.height:
         return
     pixel = p[1] * camera.width + p[0]
-    hit = BvhHit()
-    hit.face = hits.face[pixel]
+    hit = primary_hit(hits, pixel)
     if hit.face < 0:
         return
-    hit.t = hits.t[pixel]
-    hit.u = hits.u[pixel]
-    hit.v = hits.v[pixel]
     towards = -hits.direction[pixel]
     s = surface_at(scene, hit.face, hit.u, hit.v, towards)
     seen = SeenLight()
-    seen.known = 1
+    seen.trust = 1.0
     if query.mode != MODE_TRACED and (query.mode == MODE_IRRADIANCE or wp.max(s.bsdf.diffuse) > 0.0):
         seen = seen_light(scene, field, query.visibility, s.position, shading_normal(s), ray_origin(s))
-    by_path = seen.known == 0
     steady = steady_light(seen.irradiance, s, query.mode)
-    numbers = ray_numbers(query, s, by_path)
+    numbers = ray_numbers(query, s, seen.trust < 1.0)
     rays = numbers[0]
+    traces = query.mode == MODE_TRACED or (query.mode == MODE_HYBRID and s.bsdf.f90 > 0.0)
     share = wp.float32(settings.sample_count)  # samples that one evaluation stands for
     if rays > 0:
         share = share / wp.float32(rays)
@@ -325,9 +339,13 @@ def trace_probes(
     glossy = wp.vec3(0.0, 0.0, 0.0)
     moment2 = wp.vec3(0.0, 0.0, 0.0)
     for i in range(wp.max(rays, 1)):
+        index = first_index + wp.uint32(i)
+        by_path = not trusts(seen, index, seed, PATH_DIMENSION)
         light = steady
-        if rays > 0:
-            by_ray = ray_light(scene, field, query, s, hit, towards, by_path, first_index + wp.uint32(i), seed)
+        if by_path:
+            light = Lobes()
+        if by_path or traces:
+            by_ray = ray_light(scene, field, query, s, hit, towards, by_path, index, seed)
             light.diffuse = light.diffuse + by_ray.diffuse
             light.glossy = light.glossy + by_ray.glossy
         leaving = wp.cw_mul(s.bsdf.diffuse, light.diffuse) + light.glossy
@@ -342,7 +360,7 @@ def trace_probes(
     # the variance of the mean is taken for that of `sample_count` samples, and there were count / share
     spread = moment2 * (share / count) - wp.cw_mul(mean, mean)
     buffers.moment2[pixel] = buffers.moment2[pixel] + (wp.cw_mul(mean, mean) + spread * share) * count
-    if buffers.diffuse.shape[0] > 0 and not by_path:  # a denoiser shares out what no one separated
+    if buffers.diffuse.shape[0] > 0 and seen.trust >= 1.0:  # a denoiser shares out what no one separated
         buffers.diffuse[pixel] = buffers.diffuse[pixel] + diffuse * share
         buffers.glossy[pixel] = buffers.glossy[pixel] + glossy * share
 
@@ -363,7 +381,7 @@ def count_probes(
     if hits.face[pixel] >= 0:
         s = surface_at(scene, hits.face[pixel], hits.u[pixel], hits.v[pixel], -hits.direction[pixel])
         seen = seen_light(scene, field, visibility, s.position, shading_normal(s), ray_origin(s))
-        counts[pixel] = wp.where(seen.known != 0, seen.probes, 0)
+        counts[pixel] = wp.where(seen.trust >= 1.0, seen.probes, 0)
 
 
 # What the sky sends against a direction, from the first probe that sees it there.
