@@ -40,7 +40,8 @@ class Estimator:
 
     What can be known before the first frame is a ``Bake``, which can be saved; ``start`` makes
     the first state of it, ``preprocess`` the state of each frame, and ``trace`` is called once for
-    each camera sample. An estimator keeps nothing anywhere but in its state, and leaves the previous state as it is,
+    each camera sample. For ``bake`` and ``start`` the scene is at time 0, whoever moved it before.
+    An estimator keeps nothing anywhere but in its state, and leaves the previous state as it is,
     arrays included: a frame that is interrupted is rendered again from there.
     """
 

@@ -149,9 +149,7 @@ class LightFieldProbes(Estimator):
         The grid is that of ``light_field_places.place_grid``: around what ``camera`` reaches over its whole path, or
         the scene's own cameras. What it will take is logged before it starts (logger "warp_gi", level INFO).
         """
-        target = launch.get_device(device)
-        scene.update(0.0, None, target)
-        state = ProbeState(scene, target, self, seed, camera=camera)
+        state = ProbeState(scene, launch.get_device(device), self, seed, camera=camera)
         state.bake(scene, progress)
         return state.to_bake(scene)
 
@@ -160,7 +158,6 @@ class LightFieldProbes(Estimator):
         target = launch.get_device(device)
         state = ProbeState(scene, target, self, seed, bake)
         if scene.triangle_count and not np.array_equal(bake.arrays["sky"], sky_bytes(scene)):
-            scene.update(0.0, None, target)
             state.fill(scene, lit_data(scene, target))
         state.key = _key(scene, 0.0)
         return state

@@ -60,13 +60,12 @@ class TreeState:
 
 
 def first_tree(scene: Any, device: wp.Device) -> TreeState | None:
-    """Return the tree over a scene's lights at time 0, whichever time it is at; None if there are none.
+    """Return the tree over a scene's lights as they are, at time 0 before the first frame; None if there are none.
 
     Its shape stays, so that frames do not depend on which of them was the first.
     """
     if scene.emitter_count == 0:
         return None
-    scene.update(0.0, device=device)
     bounds = light_tree.emitter_bounds(scene, scene.data(device))
     tree = light_tree.build_tree(bounds)
     return TreeState(tree, bounds, light_tree.to_device(tree, device))

@@ -125,9 +125,7 @@ class VisibilityField(Estimator):
         """Return the masks of all cells, or, when ``lazy`` and there is a camera, of those that it sees."""
         if self.mode == "traced":
             return None
-        target = launch.get_device(device)
-        scene.update(0.0, None, target)
-        state = FieldState(scene, target, self, seed)
+        state = FieldState(scene, launch.get_device(device), self, seed)
         cells = cells_on_path(state, camera) if self.lazy and camera is not None else None
         state.bake(cells, progress)
         return state.to_bake()
