@@ -110,8 +110,10 @@ def test_a_path_stage_traces_paths(view):
 
 def test_leaks_cover_lit_and_dark_and_the_cylinders_cover_probes():
     views = probes_views.room_views((24, 16), "cpu", 16)
-    common = SMALL | {"counts": (8, 3, 4), "relocate": False}
-    rows = [probes_light._leak_row(views, common | {"weights": weights}) for weights in ("visibility", "trilinear")]
+    ways = ({"weights": "visibility", "relocate": True}, {"weights": "trilinear", "relocate": False})
+    rows = [
+        probes_light._leak_row(views, SMALL | {"counts": (8, 3, 4), "irradiance_resolution": 16} | way) for way in ways
+    ]
     assert rows[0]["dark / lit"] < 0.1 * rows[1]["dark / lit"]
     assert_published("leaks: two_rooms", rows)
     box = probes_views.view_of(stages.Case("cylinders"), (32, 32), "cpu", 64)
