@@ -152,7 +152,7 @@ def test_irradiance_is_that_of_a_furnace():
     np.testing.assert_allclose(ours[seeing > 0], np.pi, rtol=0.04)
 
 
-def test_irradiance_is_compared_where_probes_know_it(view):
+def test_irradiance_is_compared_with_that_of_paths(view):
     case = probes_defaults.DefaultCase("cornell_box")
     rows = probes_defaults.irradiance_rows(case, view, **SMALL, counts=(4, 4, 4))
     assert [row["visibility"] for row in rows] == ["probes", "exact"]
@@ -160,6 +160,18 @@ def test_irradiance_is_compared_where_probes_know_it(view):
         assert 0.9 < row["mean / paths"] < 1.15 and 0 < row["RMSE / mean"] < 0.5 and 0 <= row["left to paths"] < 0.2
         assert row["RMSE"] / row["RMSE / mean"] > 2 * view.reference.mean()  # W/m^2 over radiance: pi / albedo
     assert_published(probes_defaults.IRRADIANCE_TABLE, rows)
+
+
+def test_points_that_are_left_to_paths_are_counted_and_not_compared(view, monkeypatch):
+    """Of four columns one is the sky, one has too few probes, and the others are right."""
+    seeing = np.tile(np.int32([-1, 0, 8, 1]), (2, 1))
+    ours, paths = np.zeros((2, 4, 3), np.float32), np.full((2, 4, 3), 5.0, np.float32)
+    ours[:, 2:] = paths[:, 2:] = 2.0
+    monkeypatch.setattr(probes_defaults, "of_probes", lambda stage, visibility: (ours, seeing))
+    monkeypatch.setattr(probes_defaults, "path_traced", lambda stage, spp, seed: paths)
+    case = probes_defaults.DefaultCase("cornell_box")
+    for row in probes_defaults.irradiance_rows(case, view, **SMALL, counts=(4, 4, 4)):
+        assert (row["mean / paths"], row["RMSE"], row["left to paths"]) == (1.0, 0.0, 1 / 3)
 
 
 def test_default_settings_are_measured_in_both_modes(view):
