@@ -91,6 +91,8 @@ _FLIGHT = gi.CameraPath(
         gi.CameraKey(2.0, (9.0, 2.0, 0.3), (25.0, 4.0, 0.0)),
     )
 )
+_GALLERY = _still((-9, 6.2, 4.6), (6, 3, -3), 65.0)
+_FLOOR = _still((8, 0.4, -0.8), (-6, 0.2, 1.5), 65.0)
 _WINDOWS = _still((0, 1, 4), (0.5, 1.2, 0), 60.0)
 _INTO_THE_ROOM = _still((0, 1.3, 1.2), (0.3, 1.1, 6), 60.0)
 _ROOFS = _still((-40, 45, -60), (-10, 0, -10), 60.0)
@@ -132,5 +134,9 @@ PLACES: dict[str, Place] = {
     "sponza": Place("Sponza", _SPONZA, _NAVE, WHITE),
     "sponza_courtyard": Place("Sponza, courtyard sky", _SPONZA, _NAVE, COURTYARD),
     "sponza_flight": Place("Sponza, flight", _SPONZA, _FLIGHT, WHITE),
+    "sponza_floor": Place("Sponza, floor", _SPONZA, _FLOOR, WHITE),
+    "sponza_floor_courtyard": Place("Sponza, floor, courtyard sky", _SPONZA, _FLOOR, COURTYARD),
+    "sponza_gallery": Place("Sponza, gallery", _SPONZA, _GALLERY, WHITE),
+    "sponza_gallery_courtyard": Place("Sponza, gallery, courtyard sky", _SPONZA, _GALLERY, COURTYARD),
 }
 """By key. Suites name keys, and add what is theirs: targets, settings of estimators, depths, sizes."""

@@ -1,4 +1,4 @@
-"""Light field probes: rays beside the tree's, leaks, indirect light beside the path tracer, bakes, and denoisers.
+"""Light field probes: default settings beside the path tracer, rays, leaks, modes, bakes, and denoisers.
 
 Seconds of a mode are of the indirect stage alone, primary rays apart.
 What the paper measured stands in tables of its own.
@@ -10,11 +10,19 @@ from collections.abc import Sequence
 
 from warp_gi.bench.gallery import CLOSED, Gallery, run_parts
 from warp_gi.bench.measure import Row
+from warp_gi.bench.probes_defaults import default_rows
 from warp_gi.bench.probes_denoise import denoise_rows
 from warp_gi.bench.probes_light import bake_rows, leak_rows, light_rows
 from warp_gi.bench.probes_rays import ray_rows
 
-PARTS = {"rays": ray_rows, "leaks": leak_rows, "light": light_rows, "bakes": bake_rows, "denoise": denoise_rows}
+PARTS = {
+    "defaults": default_rows,
+    "rays": ray_rows,
+    "leaks": leak_rows,
+    "light": light_rows,
+    "bakes": bake_rows,
+    "denoise": denoise_rows,
+}
 
 
 def run(quick: bool = False, device: str = "cpu", parts: Sequence[str] = (), gallery: Gallery = CLOSED) -> list[Row]:

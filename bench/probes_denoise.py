@@ -26,12 +26,15 @@ PIPELINES: dict[str, dict[str, Any]] = {
 
 
 def denoise_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
-    """Return a row for each scene, pipeline and number of rays: the beauty against that of the pipeline's many rays."""
-    size, spp = ((240, 135), 64) if quick else ((480, 270), 512)
+    """Return a row for each scene, pipeline and number of rays: the beauty against that of the pipeline's many rays.
+
+    Probes are in the first scene only.
+    """
+    size, spp = ((120, 68), 32) if quick else ((480, 270), 256)
     rows: list[Row] = []
     for case in CASES[: 1 if quick else None]:
         scene, path = case.scene(), case.path().at_resolution(*size)
-        for label, terms in PIPELINES.items():
+        for label, terms in PIPELINES.items() if case is CASES[0] else [("paths", PIPELINES["paths"])]:
             rows += pipeline_rows(case.name, scene, path, label, terms, spp, device, gallery)
     return rows
 
@@ -48,7 +51,7 @@ def pipeline_rows(
 ) -> list[Row]:
     """Return the rows of one scene and pipeline; pictures are of the fewest rays."""
     indirect = terms.get("indirect")
-    bakes = [gi.bake(scene, indirect, device)] if indirect is not None else []
+    bakes = [gi.bake(scene, indirect, device, camera_path=path)] if indirect is not None else []
     many = gi.Pipeline(**terms, spp=spp, camera_samples=1)
     truth = gi.FrameScheduler(scene, path, many, device, seed=101, bakes=bakes).frame(FRAME).numpy("beauty")
     rows: list[Row] = []

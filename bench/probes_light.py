@@ -9,7 +9,6 @@ import numpy as np
 import warp_gi as gi
 from warp_gi.bench.gallery import CLOSED, Gallery, PictureSet
 from warp_gi.bench.measure import Row, ratios, timed
-from warp_gi.bench.places import PLACES
 from warp_gi.bench.probes_views import (
     CORNELL,
     GLOSSY_LIVING_ROOM,
@@ -17,6 +16,8 @@ from warp_gi.bench.probes_views import (
     ROOM,
     SPONZA,
     View,
+    counts_of,
+    room_views,
     view_of,
 )
 from warp_gi.bench.stages import Case, Stage, race
@@ -26,8 +27,17 @@ SPP = 4
 """Of the modes that trace rays."""
 PATH_SPP = 16
 """That the path tracer's time and noise a sample are measured with."""
-QUICK_GRIDS = 2
+QUICK_GRIDS = 1
 """Places whose light the quick form measures."""
+RESOLUTION = 128
+"""Texels along a side of a map, unless a table varies them."""
+WAYS = {
+    "irradiance": {"mode": "irradiance"},
+    "hybrid": {"mode": "hybrid", "through": "probes"},
+    "traced": {"mode": "traced", "through": "probes"},
+    "traced, geometry": {"mode": "traced", "through": "geometry"},
+}
+"""Modes as the paper has them, whose rays march through the probes, and one whose rays go through the scene."""
 PAPER_CARD = "GeForce 1080"
 PAPER_MS = (
     ("Cornell Box", "2 x 2 x 2", 2048, 0.358, 0.000),
@@ -47,16 +57,12 @@ PAPER_BAKE = "60 to 120 s"
 def leak_rows(quick: bool, device: str) -> list[Row]:
     """Return rows of the dark room of two, with and without visibility, and of cylinders over probes."""
     size, spp = ((96, 64), 64) if quick else ((240, 160), 256)
-    rooms = {"lit": PLACES["two_rooms"], "dark": PLACES["two_rooms_dark"]}
-    scene = rooms["lit"].scene()
-    views = {name: View(scene, room.camera().at_resolution(*size), device, spp) for name, room in rooms.items()}
-    views["dark"].bakes = views["lit"].bakes
+    views = room_views(size, device, spp)
     rows: list[Row] = []
-    for resolution in (128,) if quick else (128, 256):
-        for counts in ((0, 0, 0),) if quick else ((0, 0, 0), (8, 3, 4)):
-            for weights, relocate in (("visibility", True), ("visibility", False), ("trilinear", False)):
-                settings = {"counts": counts, "resolution": resolution, "weights": weights, "relocate": relocate}
-                rows.append(_leak_row(views, settings))
+    for counts in ((4, 2, 2),) if quick else ((4, 2, 2), (8, 3, 4)):
+        for weights, relocate in (("visibility", True), ("visibility", False), ("trilinear", False)):
+            settings = {"counts": counts, "resolution": 128, "weights": weights, "relocate": relocate}
+            rows.append(_leak_row(views, settings))
     view = view_of(Case("cylinders"), size, device, spp)
     for weights, relocate in (("visibility", True), ("visibility", False), ("trilinear", False)):
         stage = view.stage(1, mode="irradiance", counts=(3, 2, 3), weights=weights, relocate=relocate)
@@ -69,7 +75,7 @@ def _leak_row(views: dict[str, View], settings: dict[str, Any]) -> Row:
     means = {name: view.stage(1, mode="irradiance", **settings) for name, view in views.items()}
     lit, dark = (float(means[name].picture.mean(dtype=np.float64)) for name in ("lit", "dark"))
     paths = float(views["lit"].reference.mean(dtype=np.float64))
-    row: Row = {"table": "leaks: two_rooms", "probes": _counts(means["lit"]), "resolution": settings["resolution"]}
+    row: Row = {"table": "leaks: two_rooms", "probes": counts_of(means["lit"]), "resolution": settings["resolution"]}
     row |= {"weights": settings["weights"], "relocate": settings["relocate"], "covered": covered(means["lit"])}
     return row | {"dark / lit": dark / lit, "target": 0.01, "lit / paths": lit / paths}
 
@@ -97,29 +103,24 @@ def _blocks(image: np.ndarray, size: int = 8) -> np.ndarray:
     return image[:height, :width].reshape(height // size, size, width // size, size, 3).mean(axis=(1, 3, 4))
 
 
-def _counts(stage: Stage) -> str:
-    return " x ".join(map(str, stage.state.grid.counts))
-
-
 # ---- modes ----
 
 
 def light_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
     """Return errors and times of the modes by place and grid, what the path tracer needs for the same, and table 1."""
     grids: list[tuple[Case, list[dict[str, Any]]]] = [
-        (CORNELL, _grids((2, 2, 2), (4, 4, 4), (8, 8, 8))),
-        (LIVING_ROOM, _grids((4, 4, 4), (8, 4, 8))),
+        (CORNELL, _grids((4, 4, 4), (8, 8, 8))),
         (ROOM, _grids((4, 4, 4), (8, 4, 8))),
-        (SPONZA, _grids((0, 0, 0), (8, 4, 4), (16, 8, 8))),
-        (GLOSSY_LIVING_ROOM, _grids((4, 4, 4), (8, 4, 8))),
+        (SPONZA, _grids((8, 4, 4), (12, 6, 6))),
+        (GLOSSY_LIVING_ROOM, _grids((8, 4, 8))),
     ]
     rows: list[Row] = []
     for place, settings in grids[:QUICK_GRIDS] if quick else grids:
         if place.missing:
             rows.append({"table": "indirect light", "case": place.name, "skipped": place.missing})
             continue
-        view = view_of(place, (160, 90) if quick else (320, 180), device, 64 if quick else 512)
-        rows += mode_rows(place, view, settings[:1] if quick else settings, 3 if quick else 5, gallery)
+        view = view_of(place, (80, 45) if quick else (240, 135), device, 32 if quick else 256)
+        rows += mode_rows(place, view, settings[:1] if quick else settings, 1 if quick else 3, gallery)
     for name, counts, resolution, lambertian, glossy in PAPER_MS:
         row = {
             "table": f"indirect light: paper, {PAPER_CARD}",
@@ -132,7 +133,7 @@ def light_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]
 
 
 def _grids(*counts: tuple[int, int, int]) -> list[dict[str, Any]]:
-    return [{"counts": number} for number in counts]
+    return [{"counts": number, "resolution": RESOLUTION} for number in counts]
 
 
 def mode_rows(
@@ -148,27 +149,25 @@ def mode_rows(
     rows: list[Row] = []
     for settings in grids:
         stages: dict[str, Stage] = {"paths": paths}
-        for mode in ("irradiance", "hybrid", "traced"):
-            stages[mode] = view.stage(1 if mode == "irradiance" else SPP, mode=mode, **settings)
+        for name, way in WAYS.items():
+            stages[name] = view.stage(1 if name == "irradiance" else SPP, **settings, **way)
         taken = race(stages, repetitions, view.device)
         one_sample = taken["paths"].cost / PATH_SPP
-        for mode, stage in stages.items():
-            if mode == "paths":
-                continue
-            seconds = taken[mode].cost
+        for name, way in WAYS.items():
+            stage, seconds = stages[name], taken[name].cost
             quality = view.quality(stage.picture)
             needed = max(noise / max(quality["RMSE"] ** 2, 1e-30), 1.0)
-            row: Row = {"table": "indirect light", "case": place.name, "probes": _counts(stage), "mode": mode}
-            row |= {"spp": stage.spp} | quality
-            row |= {"ns a pixel": seconds / np.prod(view.camera.resolution) * 1e9} | taken[mode].row()
+            row: Row = {"table": "indirect light", "case": place.name, "probes": counts_of(stage)}
+            row |= {"mode": way["mode"], "through": way.get("through", "none"), "spp": stage.spp} | quality
+            row |= {"ns a pixel": seconds / np.prod(view.camera.resolution) * 1e9} | taken[name].row()
             row["paths spp for this RMSE"] = needed
-            ratio = ratios("faster, {}", taken["paths"], taken[mode])
-            row |= {name: value * needed / PATH_SPP for name, value in ratio.items()}
-            row["target"] = place.target if mode == "irradiance" else 0.0
+            ratio = ratios("faster, {}", taken["paths"], taken[name])
+            row |= {key: value * needed / PATH_SPP for key, value in ratio.items()}
+            row["target"] = place.target if name == "irradiance" else 0.0
             samples = max(seconds / one_sample, 1.0)
             rows.append(row | {"paths RMSE in this time": float((noise / samples) ** 0.5)})
-    pictures = {mode: stage.picture for mode, stage in stages.items() if mode != "paths"}
-    case = f"{place.name}: indirect light, {_counts(stages['irradiance'])} probes"
+    pictures = {name: stage.picture for name, stage in stages.items() if name != "paths"}
+    case = f"{place.name}: indirect light, {counts_of(stages['irradiance'])} probes"
     gallery.add(PictureSet(case, view.reference, pictures))
     return rows
 
@@ -179,7 +178,7 @@ def mode_rows(
 def bake_rows(quick: bool, device: str) -> list[Row]:
     """Return seconds and memory of bakes, passes until light had settled, and milliseconds to refresh a probe."""
     rows: list[Row] = []
-    for place in (CORNELL, LIVING_ROOM, SPONZA):
+    for place in (CORNELL,) if quick else (CORNELL, LIVING_ROOM, SPONZA):
         if place.missing:
             rows.append({"table": "bakes", "case": place.name, "skipped": place.missing})
             continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi.bench.measure import Row, Times
+from warp_gi.bench.places import PLACES
 from warp_gi.bench.presets import REFERENCE_DEPTH
 from warp_gi.bench.stages import LAMBERT, PLAIN, Case, Stage, timed_bake
 from warp_gi.metrics import RELATIVE_EPSILON
@@ -32,6 +34,8 @@ class View:
     camera: gi.Camera
     device: str = "cpu"
     reference_spp: int = 64
+    path: gi.CameraPath | None = None
+    """What its bakes are for, if more than the camera."""
     bakes: dict[str, tuple[gi.Bake, Times]] = field(default_factory=dict)
     _halves: list[np.ndarray] = field(default_factory=list)
 
@@ -39,7 +43,7 @@ class View:
         """Return the bake and what it took, compilation apart."""
         key = repr(estimator.bake_settings(self.scene))
         if key not in self.bakes:
-            self.bakes[key] = timed_bake(self.scene, estimator, self.device)
+            self.bakes[key] = timed_bake(self.scene, estimator, self.device, self.path or self.camera)
         return self.bakes[key]
 
     def stage(self, spp: int, **settings: Any) -> Stage:
@@ -64,13 +68,8 @@ class View:
         return np.mean(self.halves, axis=0)
 
     def mean_squared(self, picture: np.ndarray, relative: bool = False) -> float:
-        """Return the mean squared error against what the path tracer would give without noise.
-
-        Errors against one half times errors against the other: the noise of independent halves has mean 0.
-        """
-        a, b = (half.astype(np.float64) for half in self.halves)
-        weight = 1.0 / (((a + b) / 2) ** 2 + RELATIVE_EPSILON) if relative else 1.0
-        return max(float(np.mean((picture - a) * (picture - b) * weight)), 0.0)
+        """Return the mean squared error against what the path tracer would give without noise."""
+        return mean_squared(picture, self.halves, relative)
 
     def quality(self, picture: np.ndarray) -> Row:
         """Return the row of a picture's errors."""
@@ -88,3 +87,27 @@ class View:
 def view_of(place: Case, size: tuple[int, int], device: str, reference_spp: int) -> View:
     """Return the view of a place at a size in pixels."""
     return View(place.scene(), place.camera().at_resolution(*size), device, reference_spp)
+
+
+def room_views(size: tuple[int, int], device: str, reference_spp: int) -> dict[str, View]:
+    """Return the views of the rooms "lit" and "dark" of two; what one bakes, for both cameras, the other has too."""
+    rooms = {"lit": PLACES["two_rooms"], "dark": PLACES["two_rooms_dark"]}
+    scene = rooms["lit"].scene()
+    cameras = {name: room.camera().at_resolution(*size) for name, room in rooms.items()}
+    path, bakes = gi.CameraPath.from_cameras(cameras.values()), dict[str, tuple[gi.Bake, Times]]()
+    return {name: View(scene, camera, device, reference_spp, path, bakes) for name, camera in cameras.items()}
+
+
+def mean_squared(values: np.ndarray, halves: Sequence[np.ndarray], relative: bool = False) -> float:
+    """Return the mean squared error of float [..., 3] against what two halves are noisy estimates of.
+
+    Errors against one half times errors against the other: the noise of independent halves has mean 0.
+    """
+    a, b = (half.astype(np.float64) for half in halves)
+    weight = 1.0 / (((a + b) / 2) ** 2 + RELATIVE_EPSILON) if relative else 1.0
+    return max(float(np.mean((values - a) * (values - b) * weight)), 0.0)
+
+
+def counts_of(stage: Stage) -> str:
+    """Return a stage's probes along x, y and z in words."""
+    return " x ".join(map(str, stage.state.grid.counts))

@@ -19,6 +19,7 @@ from warp_gi.bench import (
     places,
     presets,
     previews,
+    probes_defaults,
     probes_denoise,
     probes_views,
     rays,
@@ -126,6 +127,7 @@ def test_files_are_read_and_what_is_missing_is_said(monkeypatch, tmp_path):
 
 def test_suites_take_places_of_the_table():
     cases = [*dvf_views.CASES, *reuse_quality.CASES, *probes_denoise.CASES, *mitsuba_reference.PICTURES.values()]
+    cases += probes_defaults.CASES
     cases += [case for module in (probes_views, reuse_views, dvf_peers) for case in cases_of(module)]
     taken = {case.place for case in [*cases, *path.CASES]} | {*rays.CASES.values(), *path.FIRST_FRAMES.values()}
     taken |= {blender_peer.FULL.scene, blender_peer.QUICK.scene}
@@ -163,7 +165,7 @@ def test_a_case_changes_materials_and_nothing_else():
 
 def test_suites_have_something_to_do_without_files(monkeypatch, tmp_path):
     monkeypatch.setattr(presets, "SCENES", tmp_path)
-    lists = [dvf_views.CASES, reuse_quality.QUICK_CASES, probes_denoise.CASES, path.CASES]
+    lists = [dvf_views.CASES, reuse_quality.QUICK_CASES, probes_denoise.CASES, probes_defaults.QUICK_CASES, path.CASES]
     for cases in (*lists, [PLACES[rays.CASES[name]] for name in rays.QUICK_SCENES]):
         assert any(not case.missing for case in cases)
 
