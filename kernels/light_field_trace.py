@@ -61,7 +61,7 @@ VISIBILITY_EXACT = wp.constant(1)
 IN_SIGHT = wp.constant(wp.float32(0.3))  # by the maps, whose bounds are kind to what is hidden
 LOBE_DIMENSION = wp.constant(2000)  # dimension pairs that no path gets to
 DIRECTION_DIMENSION = wp.constant(2001)
-PATH_DIMENSION = wp.constant(2002)
+PIXEL_DIMENSION = wp.constant(2002)
 HIT_DIMENSION = wp.constant(2003)
 
 
@@ -73,9 +73,9 @@ class ProbeQuery:
     rays: wp.int32  # of the current camera sample
     first_ray: wp.int32  # of the current camera sample, among those of the pixel
     ray_bits: wp.int32  # bits that count the rays of a pixel
-    samples: wp.int32  # the same three of the pipeline's samples, for paths where there are no rays
-    first_sample: wp.int32
-    sample_bits: wp.int32
+    unseen_rays: wp.int32  # the same three where probes do not see what the pixel shows
+    first_unseen_ray: wp.int32
+    unseen_ray_bits: wp.int32
     paths: PathSettings  # of paths that go on where no probe sees a point
 
 
@@ -206,15 +206,15 @@ def lobes_of(s: Surface, wo: wp.vec3, sample: BsdfSample, light: wp.vec3, mode: 
     return r
 
 
-# Whether a sample goes by the probes at a point, or by a path: by a random number, so that there is no edge between
-# where they are trusted and where they are not.
+# Whether a sample goes by what the probes say of a point, or by a ray from there: by a random number, so that there is no
+# edge between where they are trusted and where they are not.
 @wp.func
 def trusts(seen: SeenLight, index: wp.uint32, seed: wp.uint32, dimension: wp.int32) -> wp.bool:
     return seen.trust >= 1.0 or random_1d(index, seed, dimension) < seen.trust
 
 
 # What a surface that a ray meets reflects against the ray: its direct light, sampled, and what the probes know; or a
-# path goes on from there. `by_path` is true for the first hit of a camera ray, where a path stands for all of the term.
+# path goes on from there.
 @wp.func
 def reflected_light(
     scene: SceneData,
@@ -222,23 +222,18 @@ def reflected_light(
     query: ProbeQuery,
     hit: BvhHit,
     towards: wp.vec3,
-    by_path: wp.bool,
     index: wp.uint32,
     seed: wp.uint32,
 ) -> wp.vec3:
     s = surface_at(scene, hit.face, hit.u, hit.v, towards)
+    seen = seen_light(scene, field, query.visibility, s.position, shading_normal(s), ray_origin(s))
     paths = query.paths
+    paths.terms = TERM_ENVIRONMENT | TERM_EMITTERS
     known = wp.vec3(0.0, 0.0, 0.0)
-    if by_path:
-        paths.terms = TERM_INDIRECT
+    if trusts(seen, index, seed, HIT_DIMENSION):
+        known = wp.cw_mul(average_reflectance(s.bsdf), seen.irradiance) / wp.pi
     else:
-        normal = shading_normal(s)
-        seen = seen_light(scene, field, query.visibility, s.position, normal, ray_origin(s))
-        paths.terms = TERM_ENVIRONMENT | TERM_EMITTERS
-        if trusts(seen, index, seed, HIT_DIMENSION):
-            known = wp.cw_mul(average_reflectance(s.bsdf), seen.irradiance) / wp.pi
-        else:
-            paths.terms = TERM_ENVIRONMENT | TERM_EMITTERS | TERM_INDIRECT
+        paths.terms = TERM_ENVIRONMENT | TERM_EMITTERS | TERM_INDIRECT
     light = trace_path(scene, PathSamplers(), hit, s, towards, paths, index, seed, -1)
     return known + light.environment + light.emitters + light.indirect
 
@@ -250,55 +245,61 @@ def ray_light(
     field: LightField,
     query: ProbeQuery,
     s: Surface,
-    hit: BvhHit,
     towards: wp.vec3,
-    by_path: wp.bool,
+    mode: wp.int32,
+    through: wp.int32,
     index: wp.uint32,
     seed: wp.uint32,
 ) -> Lobes:
-    r = Lobes()
     wo = wp.transpose(s.shading) * towards
-    sample = BsdfSample()
-    start = hit
-    back = towards
-    if not by_path:
-        sample = ray_direction(s, wo, query.mode, index, seed)
-        wi = s.shading * sample.wi
-        if sample.pdf <= 0.0 or wp.dot(wi, s.normal) <= 0.0:
-            return r
-        if query.through == RAYS_PROBES:
-            return lobes_of(s, wo, sample, reflected_radiance(field, ray_origin(s), wi), query.mode)
-        start = bvh_intersect(scene.bvh, ray_origin(s), wi, float(wp.inf))
-        back = -wi
-        if start.face < 0:
-            return r
-    light = reflected_light(scene, field, query, start, back, by_path, index, seed)
-    if by_path:
-        r.glossy = light
-        return r
-    return lobes_of(s, wo, sample, light, query.mode)
+    sample = ray_direction(s, wo, mode, index, seed)
+    wi = s.shading * sample.wi
+    if sample.pdf <= 0.0 or wp.dot(wi, s.normal) <= 0.0:
+        return Lobes()
+    if through == RAYS_PROBES:
+        return lobes_of(s, wo, sample, reflected_radiance(field, ray_origin(s), wi), mode)
+    hit = bvh_intersect(scene.bvh, ray_origin(s), wi, float(wp.inf))
+    if hit.face < 0:
+        return Lobes()
+    return lobes_of(s, wo, sample, reflected_light(scene, field, query, hit, -wi, index, seed), mode)
 
 
+# Light of one sample of a pixel: what the probes say and, if the mode `traces`, that of a ray; or a ray of the whole BSDF
+# instead of both, where too few probes see the point.
 @wp.func
-def primary_hit(hits: PrimaryHits, pixel: wp.int32) -> BvhHit:
-    hit = BvhHit()
-    hit.face = hits.face[pixel]
-    hit.t = hits.t[pixel]
-    hit.u = hits.u[pixel]
-    hit.v = hits.v[pixel]
-    return hit
+def sample_light(
+    scene: SceneData,
+    field: LightField,
+    query: ProbeQuery,
+    s: Surface,
+    towards: wp.vec3,
+    seen: SeenLight,
+    traces: wp.bool,
+    index: wp.uint32,
+    seed: wp.uint32,
+) -> Lobes:
+    light = Lobes()
+    mode = query.mode
+    through = query.through
+    trusted = trusts(seen, index, seed, PIXEL_DIMENSION)
+    if trusted:
+        light = steady_light(seen.irradiance, s, mode)
+    else:
+        mode = MODE_TRACED
+        through = RAYS_GEOMETRY
+    if traces or not trusted:
+        by_ray = ray_light(scene, field, query, s, towards, mode, through, index, seed)
+        light.diffuse = light.diffuse + by_ray.diffuse
+        light.glossy = light.glossy + by_ray.glossy
+    return light
 
 
 # Rays of a pixel in the current camera sample, the first of them, and the bits that count those of the pixel.
 @wp.func
-def ray_numbers(query: ProbeQuery, s: Surface, may_trace_paths: wp.bool) -> wp.vec3i:
-    if query.mode == MODE_IRRADIANCE:
-        if may_trace_paths:
-            return wp.vec3i(query.samples, query.first_sample, query.sample_bits)
-        return wp.vec3i(0, query.first_ray, query.ray_bits)
-    if query.mode == MODE_HYBRID and s.bsdf.f90 <= 0.0 and not may_trace_paths:
-        return wp.vec3i(0, query.first_ray, query.ray_bits)
-    return wp.vec3i(query.rays, query.first_ray, query.ray_bits)
+def ray_numbers(query: ProbeQuery, trust: wp.float32, traces: wp.bool) -> wp.vec3i:
+    if trust < 1.0:
+        return wp.vec3i(query.unseen_rays, query.first_unseen_ray, query.unseen_ray_bits)
+    return wp.vec3i(wp.where(traces, query.rays, 0), query.first_ray, query.ray_bits)
 
 
 # Thread: a pixel.
@@ -317,19 +318,17 @@ def trace_probes(
     if p[0] >= camera.width or p[1] >= camera.height:
         return
     pixel = p[1] * camera.width + p[0]
-    hit = primary_hit(hits, pixel)
-    if hit.face < 0:
+    if hits.face[pixel] < 0:
         return
     towards = -hits.direction[pixel]
-    s = surface_at(scene, hit.face, hit.u, hit.v, towards)
+    s = surface_at(scene, hits.face[pixel], hits.u[pixel], hits.v[pixel], towards)
     seen = SeenLight()
     seen.trust = 1.0
     if query.mode != MODE_TRACED and (query.mode == MODE_IRRADIANCE or wp.max(s.bsdf.diffuse) > 0.0):
         seen = seen_light(scene, field, query.visibility, s.position, shading_normal(s), ray_origin(s))
-    steady = steady_light(seen.irradiance, s, query.mode)
-    numbers = ray_numbers(query, s, seen.trust < 1.0)
-    rays = numbers[0]
     traces = query.mode == MODE_TRACED or (query.mode == MODE_HYBRID and s.bsdf.f90 > 0.0)
+    numbers = ray_numbers(query, seen.trust, traces)
+    rays = numbers[0]
     share = wp.float32(settings.sample_count)  # samples that one evaluation stands for
     if rays > 0:
         share = share / wp.float32(rays)
@@ -340,14 +339,7 @@ def trace_probes(
     moment2 = wp.vec3(0.0, 0.0, 0.0)
     for i in range(wp.max(rays, 1)):
         index = first_index + wp.uint32(i)
-        by_path = not trusts(seen, index, seed, PATH_DIMENSION)
-        light = steady
-        if by_path:
-            light = Lobes()
-        if by_path or traces:
-            by_ray = ray_light(scene, field, query, s, hit, towards, by_path, index, seed)
-            light.diffuse = light.diffuse + by_ray.diffuse
-            light.glossy = light.glossy + by_ray.glossy
+        light = sample_light(scene, field, query, s, towards, seen, traces, index, seed)
         leaving = wp.cw_mul(s.bsdf.diffuse, light.diffuse) + light.glossy
         diffuse = diffuse + light.diffuse
         glossy = glossy + light.glossy
@@ -360,13 +352,13 @@ def trace_probes(
     # the variance of the mean is taken for that of `sample_count` samples, and there were count / share
     spread = moment2 * (share / count) - wp.cw_mul(mean, mean)
     buffers.moment2[pixel] = buffers.moment2[pixel] + (wp.cw_mul(mean, mean) + spread * share) * count
-    if buffers.diffuse.shape[0] > 0 and seen.trust >= 1.0:  # a denoiser shares out what no one separated
+    if buffers.diffuse.shape[0] > 0:
         buffers.diffuse[pixel] = buffers.diffuse[pixel] + diffuse * share
         buffers.glossy[pixel] = buffers.glossy[pixel] + glossy * share
 
 
-# Thread: a pixel of a first hit. How many of the probes around it see it, 1 to 8; 0 where paths are traced, -1 where
-# nothing was hit.
+# Thread: a pixel of a first hit. How many of the probes around it see it, 1 to 8; 0 where too few do and rays are
+# traced, -1 where nothing was hit.
 @wp.kernel
 def count_probes(
     first: wp.int32,

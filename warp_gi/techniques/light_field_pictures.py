@@ -214,7 +214,7 @@ def draw_places(frame: Frame, state: Any) -> np.ndarray:
 def probes_in_sight(frame: Frame, state: Any) -> np.ndarray:
     """Return how many of the eight probes around it see what a pixel of the last camera sample shows.
 
-    int32 [height, width]: 0 where too few do and paths are traced, -1 where there is no surface.
+    int32 [height, width]: 0 where too few do and rays are traced, -1 where there is no surface.
     """
     width, height = frame.camera.resolution
     counts = wp.empty(width * height, dtype=wp.int32, device=frame.device)
@@ -232,8 +232,8 @@ def draw_seen(frame: Frame, state: Any) -> np.ndarray:
     image[counts < 0] = 255
     surface = counts >= 0
     unseen = float((counts == 0).sum() / max(surface.sum(), 1))
-    keys = [(tuple(map(int, colors[n])), str(n) if n else "too few: paths are traced") for n in range(9)]
-    title = f"probes, of the eight around it, that see a point; {unseen:.1%} of the surface in view is left to paths"
+    keys = [(tuple(map(int, colors[n])), str(n) if n else "too few: rays are traced") for n in range(9)]
+    title = f"probes, of the eight around it, that see a point; {unseen:.1%} of the surface in view is left to rays"
     return with_keys(image.astype(np.uint8), tuple(keys), title)
 
 

@@ -30,6 +30,8 @@ VISIBILITIES = {"probes": trace_kernels.VISIBILITY_PROBES, "exact": trace_kernel
 _PRIMARIES = ("geometry", "probes")
 _WEIGHTS = ("visibility", "trilinear")
 MOST_RESOLUTION = 1024
+UNSEEN_RAYS = 16
+"""Least rays of a pixel whose surface too few probes see; these are few pixels, and beside the others look noisy."""
 SAME_VIEW = 1e-4
 """Share of its size by which a number of a camera may differ from that of one that a bake was made for."""
 SETTLED = 0.02
@@ -54,7 +56,7 @@ class LightFieldProbes(Estimator):
     the probes' irradiance. "probes": their maps alone, as in the paper, which takes many times as long on a CPU."""
     visibility: Literal["probes", "exact"] = "probes"
     """Who tells which of the eight probes around a point see it: their maps, or "exact" shadow rays, for less light
-    behind walls at two or three times the price. Where too few see it a path is traced."""
+    behind walls at two or three times the price. Where too few see it rays are traced."""
     counts: tuple[int, int, int] = (0, 0, 0)
     """Probes along x, y and z of the box that paths from the camera reach; 0 follows from the spacing."""
     spacing: float = 0.0
@@ -163,7 +165,7 @@ class LightFieldProbes(Estimator):
         return state
 
     def check_view(self, bake: Bake, camera: Camera | CameraPath) -> None:
-        """Warn if a bake was made for another camera path: where its probes see nothing, paths are traced."""
+        """Warn if a bake was made for another camera path: where its probes see nothing, rays are traced."""
         made_for, wanted = bake.arrays["cameras"], camera_rows(cameras_of(camera))
         known = (
             np.abs(wanted[:, None] - made_for).max(axis=2)
@@ -172,7 +174,7 @@ class LightFieldProbes(Estimator):
         if not known.any(axis=1).all():
             warnings.warn(
                 f"this bake of probes is {'of another camera path' if len(made_for) else 'of no camera'}: "
-                "where too few of its probes see a surface, paths are traced, with noise: bake for this camera",
+                "where too few of its probes see a surface, rays are traced, with noise: bake for this camera",
                 stacklevel=2,
             )
 
@@ -227,13 +229,13 @@ class LightFieldProbes(Estimator):
         query = trace_kernels.ProbeQuery()
         query.mode, query.through = _MODES[self.mode], _THROUGH[self.through]
         query.visibility = VISIBILITIES[self.visibility]
-        query.samples, query.first_sample = settings.sample_count, settings.first_sample
-        query.sample_bits = settings.sample_bits
-        query.rays, query.first_ray, query.ray_bits = query.samples, query.first_sample, query.sample_bits
+        query.rays, query.first_ray, query.ray_bits = settings.sample_count, settings.first_sample, settings.sample_bits
         if self.pixel_rays:
-            query.rays = -(-self.pixel_rays // settings.camera_samples)
-            query.first_ray = settings.camera_sample * query.rays
-            query.ray_bits = (query.rays * settings.camera_samples - 1).bit_length()
+            query.rays, query.first_ray, query.ray_bits = _evenly(self.pixel_rays, settings)
+        unseen = query.rays, query.first_ray, query.ray_bits
+        if (self.pixel_rays or frame.pipeline.spp) < UNSEEN_RAYS:
+            unseen = _evenly(UNSEEN_RAYS, settings)
+        query.unseen_rays, query.first_unseen_ray, query.unseen_ray_bits = unseen
         query.paths = path_settings(frame.scene)
         buffers = trace_kernels.ProbeBuffers()
         buffers.indirect = frame["indirect"]
@@ -249,6 +251,12 @@ class LightFieldProbes(Estimator):
         buffers = frame.struct(trace_kernels.ProbeView)
         inputs = [frame.camera_data, frame.pass_settings, state.field, buffers]
         frame.launch_tiled(trace_kernels.view_probes, inputs)
+
+
+def _evenly(rays: int, settings: Any) -> tuple[int, int, int]:
+    """Return how many rays a camera sample has, its first, and the bits of their number: so many shared out evenly."""
+    each = -(-rays // settings.camera_samples)
+    return each, settings.camera_sample * each, (each * settings.camera_samples - 1).bit_length()
 
 
 def _key(scene: Any, time: float) -> str:
