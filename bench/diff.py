@@ -56,7 +56,7 @@ RULES: tuple[tuple[str, Measure | None], ...] = (
     (r"/ ?((wall|cpu) )?s$|\ba minute$", RATE),
     (r"\bagree|\bPSNR\b", ACCURACY),
     (r"\bequal time$|\b(time|cost|paths) / baseline$", TIME),
-    (r"\bequal samples$|/ baseline$|MSE\b|\bbad pixels\b|\bFLIP\b|\berrors?\b|\bwrong\b|\bbias\b", ERROR),
+    (r"\bequal samples$|/ baseline$|MSE\b|\b(bad|black) pixels\b|\bFLIP\b|\berrors?\b|\bwrong\b|\bbias\b", ERROR),
     (r"\buntil settled$|^dark / lit$|^peak / settled$", ERROR),
     (r"^(exponent|growth)\b", TIME),
     (r"\b(bytes|[kKMG]i?B)\b", MEMORY),

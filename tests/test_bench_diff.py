@@ -23,7 +23,7 @@ def names(changes):
 
 LOWER = """wall s | paths ms | seconds | ns a pixel | wall s to 0.01 | MSE beauty | ours relMSE | RMSE | ST FLIP
     | error ratio | bytes a triangle | KB | peak GB | beauty / baseline | beauty, equal time | wrong per million
-    | bad pixels | device s | RMSE at equal time | object kB | frames until settled | dark / lit"""
+    | bad pixels | black pixels | device s | RMSE at equal time | object kB | frames until settled | dark / lit"""
 HIGHER = """Mrays/s | Mrays/wall s | faster, cpu | speed-up | x | faster at equal error, cpu | agree | ratio cpu
     | ours frames a minute | ratio device | bake / raw, cpu | of tree
     | embree / ours | ours / embree | times mitsuba, wall"""
