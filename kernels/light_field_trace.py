@@ -381,7 +381,7 @@ def count_probes(
     if hits.face[pixel] >= 0:
         s = surface_at(scene, hits.face[pixel], hits.u[pixel], hits.v[pixel], -hits.direction[pixel])
         seen = seen_light(scene, field, visibility, s.position, shading_normal(s), ray_origin(s))
-        counts[pixel] = wp.where(seen.trust >= 1.0, seen.probes, 0)
+        counts[pixel] = wp.where(seen.trust >= 1.0, wp.max(seen.probes, 1), 0)
 
 
 # What the sky sends against a direction, from the first probe that sees it there.
