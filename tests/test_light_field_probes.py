@@ -483,6 +483,22 @@ def test_far_from_the_grid_its_light_counts_for_nothing():
     assert image.mean() < 0.01 * indirect(scene, near, bakes=[bake], **settings).mean()
 
 
+def test_a_bake_for_a_path_fits_each_of_its_frames():
+    """Without a word; a bake by an earlier version, which does not know its cameras, is an error."""
+    scene = lamp_room()
+    path = gi.CameraPath.from_cameras([view((8, 6)), gi.Camera.look_at((0, 0, 0.5), (0, 0, -1))], times=[0.0, 4.0])
+    bake = gi.bake(scene, gi.LightFieldProbes(**SMALL), camera_path=path)
+    frames = [path.camera(index).at_resolution(8, 6) for index in range(0, path.frame_count, 7)]
+    assert path.frame_count > 90
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for camera in (*frames, path):
+            indirect_only(**SMALL).indirect.check_view(bake, camera)
+    del bake.arrays["cameras"]
+    with pytest.raises(gi.BakeError, match="by an earlier version"):
+        indirect(scene, view(), bakes=[bake], **SMALL)
+
+
 def test_nothing_is_black_under_a_stair_that_no_probe_looks_under():
     """A shelf above the floor with a hand's breadth of room: pixels below it are not 0 where paths find light."""
     shelf = quad((-0.9, -0.86, 0.9), (1.8, 0, 0), (0, 0, -1.8), gi.Material("shelf", (0.7,) * 3, specular=0.0))
