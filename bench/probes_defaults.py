@@ -126,7 +126,7 @@ def irradiance_rows(case: DefaultCase, view: View, **settings: Any) -> list[Row]
         mean = float(np.mean(paths, dtype=np.float64))
         error = mean_squared(ours, paths) ** 0.5
         row: Row = {"table": IRRADIANCE_TABLE, "case": case.name, "visibility": visibility}
-        row |= {"probes": counts_of(stage), "left to paths": float((probes == 0).sum() / max((probes >= 0).sum(), 1))}
+        row |= {"probes": counts_of(stage), "left to rays": float((probes == 0).sum() / max((probes >= 0).sum(), 1))}
         row |= {"mean / paths": float(ours.mean(dtype=np.float64)) / mean, "RMSE": error, "RMSE / mean": error / mean}
         rows.append(row)
     return rows

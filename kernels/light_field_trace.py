@@ -2,7 +2,8 @@
 
 What probes hold is reflected light; what a ray sees of the sky and of emitters belongs to other terms. Rays are traced
 through the scene, and what they meet is lit by its own direct light and the probes' irradiance; or they are marched
-through the probes' maps. Where no probe sees a point, a path goes on from there.
+through the probes' maps. Where too few probes see what a pixel shows, rays of the whole BSDF stand for them; where too
+few see what a ray meets, a path goes on from there.
 """
 
 import warp as wp
@@ -206,8 +207,8 @@ def lobes_of(s: Surface, wo: wp.vec3, sample: BsdfSample, light: wp.vec3, mode: 
     return r
 
 
-# Whether a sample goes by what the probes say of a point, or by a ray from there: by a random number, so that there is no
-# edge between where they are trusted and where they are not.
+# Whether a sample goes by what the probes say of a point, or by a ray from there: by a random number, so that there is
+# no edge between where they are trusted and where they are not.
 @wp.func
 def trusts(seen: SeenLight, index: wp.uint32, seed: wp.uint32, dimension: wp.int32) -> wp.bool:
     return seen.trust >= 1.0 or random_1d(index, seed, dimension) < seen.trust
@@ -264,8 +265,8 @@ def ray_light(
     return lobes_of(s, wo, sample, reflected_light(scene, field, query, hit, -wi, index, seed), mode)
 
 
-# Light of one sample of a pixel: what the probes say and, if the mode `traces`, that of a ray; or a ray of the whole BSDF
-# instead of both, where too few probes see the point.
+# Light of one sample of a pixel: what the probes say and, if the mode `traces`, that of a ray; or a ray of the whole
+# BSDF instead of both, where too few probes see the point.
 @wp.func
 def sample_light(
     scene: SceneData,
@@ -373,7 +374,7 @@ def count_probes(
     if hits.face[pixel] >= 0:
         s = surface_at(scene, hits.face[pixel], hits.u[pixel], hits.v[pixel], -hits.direction[pixel])
         seen = seen_light(scene, field, visibility, s.position, shading_normal(s), ray_origin(s))
-        counts[pixel] = wp.where(seen.trust >= 1.0, seen.probes, 0)
+        counts[pixel] = wp.where(seen.trust >= 1.0, wp.max(seen.probes, 1), 0)
 
 
 # What the sky sends against a direction, from the first probe that sees it there.

@@ -461,8 +461,8 @@ def test_paths_are_traced_where_no_probe_sees(mode):
 
 @pytest.mark.parametrize("mode", ["irradiance", "hybrid"])
 def test_where_too_few_probes_see_a_path_is_all_of_the_light(monkeypatch, mode):
-    """What these few know is not added to it: the picture is that of the path tracer with the same seed."""
-    monkeypatch.setattr(light_field_state, "LEAST_SEEN", 2.0)  # more than all of them together
+    """The picture is that of the path tracer with the same seed where probes are trusted nowhere."""
+    monkeypatch.setattr(light_field_state, "LEAST_SEEN", np.inf)  # more than all of them together
     scene = lamp_room()
     truth = gi.FrameScheduler(scene, view(), gi.Pipeline(environment=None, emitters=None, spp=4), seed=1).frame(0)
     np.testing.assert_allclose(indirect(scene, spp=4, mode=mode, **SMALL), truth.numpy("indirect"), rtol=1e-5)
@@ -481,6 +481,22 @@ def test_far_from_the_grid_its_light_counts_for_nothing():
     with pytest.warns(UserWarning, match="of another camera path"):
         image = indirect(scene, far, bakes=[bake], spp=16, **settings)
     assert image.mean() < 0.01 * indirect(scene, near, bakes=[bake], **settings).mean()
+
+
+def test_a_bake_for_a_path_fits_each_of_its_frames():
+    """Without a word; a bake by an earlier version, which does not know its cameras, is an error."""
+    scene = lamp_room()
+    path = gi.CameraPath.from_cameras([view((8, 6)), gi.Camera.look_at((0, 0, 0.5), (0, 0, -1))], times=[0.0, 4.0])
+    bake = gi.bake(scene, gi.LightFieldProbes(**SMALL), camera_path=path)
+    frames = [path.camera(index).at_resolution(8, 6) for index in range(0, path.frame_count, 7)]
+    assert path.frame_count > 90
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for camera in (*frames, path):
+            indirect_only(**SMALL).indirect.check_view(bake, camera)
+    del bake.arrays["cameras"]
+    with pytest.raises(gi.BakeError, match="by an earlier version"):
+        indirect(scene, view(), bakes=[bake], **SMALL)
 
 
 def test_nothing_is_black_under_a_stair_that_no_probe_looks_under():
@@ -590,6 +606,19 @@ def test_the_picture_of_who_sees_what_counts_probes():
     assert (np.abs(counts["probes"] - counts["exact"])[known] <= 1).mean() > 0.9
     picture = draw_seen(frame, state)
     assert picture.shape[0] > 24 and picture.shape[2] == 3 and len(np.unique(picture[:24, :32].reshape(-1, 3))) > 4
+
+
+def test_only_points_left_to_paths_are_shown_as_such():
+    """Where no probe has a clear view, yet all together know enough, the picture says 1."""
+    grey = gi.Material("shelf", (0.7,) * 3, double_sided=True)
+    shelf = quad((-0.9, -0.86, 0.2), (1.8, 0, 0), (0, 0, -1.1), grey)
+    camera = gi.Camera.look_at((0, -0.92, 0.97), (0, -0.93, 0), hfov=70, resolution=(32, 12))
+    scheduler = gi.FrameScheduler(lamp_room(shelf), camera, indirect_only(**SMALL), seed=1)
+    frame, state = scheduler.frame(0), scheduler.state("indirect")
+    counts = probes_in_sight(frame, state)
+    assert (counts == 0).any() and counts.max() > 1
+    state.field.least_seen = 0.0  # the least that is seen is enough
+    assert (probes_in_sight(frame, state) > 0).all()
 
 
 # ---- frames ----

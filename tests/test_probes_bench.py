@@ -157,7 +157,7 @@ def test_irradiance_is_compared_with_that_of_paths(view):
     rows = probes_defaults.irradiance_rows(case, view, **SMALL, counts=(4, 4, 4))
     assert [row["visibility"] for row in rows] == ["probes", "exact"]
     for row in rows:
-        assert 0.9 < row["mean / paths"] < 1.15 and 0 < row["RMSE / mean"] < 0.5 and 0 <= row["left to paths"] < 0.2
+        assert 0.9 < row["mean / paths"] < 1.15 and 0 < row["RMSE / mean"] < 0.5 and 0 <= row["left to rays"] < 0.2
         assert row["RMSE"] / row["RMSE / mean"] > 2 * view.reference.mean()  # W/m^2 over radiance: pi / albedo
     assert_published(probes_defaults.IRRADIANCE_TABLE, rows)
 
@@ -171,7 +171,7 @@ def test_points_that_are_left_to_paths_are_counted_and_not_compared(view, monkey
     monkeypatch.setattr(probes_defaults, "path_traced", lambda stage, spp, seed: paths)
     case = probes_defaults.DefaultCase("cornell_box")
     for row in probes_defaults.irradiance_rows(case, view, **SMALL, counts=(4, 4, 4)):
-        assert (row["mean / paths"], row["RMSE"], row["left to paths"]) == (1.0, 0.0, 1 / 3)
+        assert (row["mean / paths"], row["RMSE"], row["left to rays"]) == (1.0, 0.0, 1 / 3)
 
 
 def test_default_settings_are_measured_in_both_modes(view):

@@ -132,13 +132,14 @@ def map_resolution(resolution: int, probes: int) -> int:
     return resolution or (FEW_RESOLUTION if probes <= UNSEEN_PROBES else MANY_RESOLUTION)
 
 
-def cameras_of(camera: Camera | CameraPath | None) -> list[Camera]:
-    """Return where a camera is over its whole path, in some frames evenly from the first to the last."""
+def cameras_of(camera: Camera | CameraPath | None, every: bool = False) -> list[Camera]:
+    """Return where a camera is over its whole path: in ``every`` frame, or in some evenly over it."""
     if camera is None:
         return []
     if isinstance(camera, Camera):
         return [camera]
-    frames = np.linspace(0, camera.frame_count - 1, min(camera.frame_count, REACH_CAMERAS))
+    count = camera.frame_count
+    frames = np.linspace(0, count - 1, count if every else min(count, REACH_CAMERAS))
     return [camera.camera(int(frame)) for frame in np.unique(np.round(frames))]
 
 

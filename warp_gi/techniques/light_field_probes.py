@@ -165,7 +165,14 @@ class LightFieldProbes(Estimator):
         return state
 
     def check_view(self, bake: Bake, camera: Camera | CameraPath) -> None:
-        """Warn if a bake was made for another camera path: where its probes see nothing, rays are traced."""
+        """Warn if a bake was made for another camera path: where its probes see nothing, rays are traced.
+
+        Raises BakeError for one by a version that did not place probes by cameras.
+        """
+        if "cameras" not in bake.arrays:
+            raise BakeError(
+                "this bake of probes is by an earlier version, whose rough surfaces were too bright: bake it again"
+            )
         made_for, wanted = bake.arrays["cameras"], camera_rows(cameras_of(camera))
         known = (
             np.abs(wanted[:, None] - made_for).max(axis=2)

@@ -314,7 +314,7 @@ class ProbeState:
             "grid_counts": np.array(self.grid.counts, np.int32),
             "bounds": scene.bounds,
             "sky": sky_bytes(scene),
-            "cameras": camera_rows(cameras_of(self.camera) or list(scene.cameras.values())),
+            "cameras": camera_rows(cameras_of(self.camera, every=True) or list(scene.cameras.values())),
         }
         counts = {
             "probes": self.grid.probe_count,
