@@ -1,5 +1,6 @@
 """The estimator of light field probes: what is baked, how it is read, and what reaches the picture."""
 
+import math
 import re
 import warnings
 from dataclasses import replace
@@ -244,6 +245,15 @@ def test_rooms_have_fewer_probes_of_finer_maps():
     assert 50 < closed.probe_count <= 100 < open_ended.probe_count <= 440
     assert map_resolution(0, closed.probe_count) == 128 and map_resolution(0, open_ended.probe_count) == 64
     assert map_resolution(32, 8) == 32
+
+
+def test_telling_what_a_bake_takes_changes_nothing_of_it(monkeypatch):
+    """Probes are filled on trial to foretell the seconds; what they hold afterwards is the same to the last bit."""
+    settings = gi.LightFieldProbes(counts=(3, 2, 3), resolution=128, irradiance_resolution=8, rays=1, bounces=2)
+    told = gi.bake(lamp_room(), settings, camera_path=view())
+    monkeypatch.setattr(light_field_state, "ANNOUNCED_TEXELS", math.inf)
+    untold = gi.bake(lamp_room(), settings, camera_path=view())
+    assert 18 * 128**2 > 1 << 18 and told.digest == untold.digest and told.counts == untold.counts
 
 
 def test_a_bake_tells_what_it_takes_before_it_starts(caplog):

@@ -17,7 +17,7 @@ from warp_gi.errors import BakeError, OptionError, check_whole, unknown_name
 from warp_gi.estimator import Ahead, Estimator
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_trace as trace_kernels
-from warp_gi.techniques.light_field_places import MOST_PROBES, camera_rows, cameras_of, lit_data, map_resolution
+from warp_gi.techniques.light_field_places import MOST_PROBES, camera_rows, cameras_of, map_resolution
 from warp_gi.techniques.light_field_state import ProbeState, path_settings, sky_bytes
 
 _MODES = {
@@ -160,7 +160,7 @@ class LightFieldProbes(Estimator):
         target = launch.get_device(device)
         state = ProbeState(scene, target, self, seed, bake)
         if scene.triangle_count and not np.array_equal(bake.arrays["sky"], sky_bytes(scene)):
-            state.fill(scene, lit_data(scene, target))
+            state.fill(scene, state.lit_data(scene))
         state.key = _key(scene, 0.0)
         return state
 
@@ -221,7 +221,7 @@ class LightFieldProbes(Estimator):
         if self.update and state.pending.any():
             state = state.copied(with_maps=True)
             probes = state.take_stale(self.update)
-            state.refresh(frame.scene, lit_data(frame.scene, frame.device), probes)
+            state.refresh(frame.scene, state.lit_data(frame.scene), probes)
         return state
 
     @property

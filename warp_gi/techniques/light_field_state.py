@@ -144,7 +144,7 @@ class ProbeState:
 
     def bake(self, scene: Any, progress: Callable[[float], None] | None = None) -> None:
         """Place all probes, and fill them."""
-        data = lit_data(scene, self.device)
+        data = self.lit_data(scene)
         if self.settings.relocate:
             relocate(scene, data, self.grid, self.field, self.device)
         self._announce(scene, data)
