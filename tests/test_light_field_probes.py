@@ -20,7 +20,7 @@ from warp_gi.kernels.bsdf import bsdf_sample, make_bsdf
 from warp_gi.kernels.sampling import sample_1d, sample_2d
 from warp_gi.kernels.surface import Surface
 from warp_gi.techniques import light_field_state
-from warp_gi.techniques.light_field_export import unpack_radiance
+from warp_gi.techniques.light_field_export import unpack_distance, unpack_radiance
 from warp_gi.techniques.light_field_pictures import draw_seen, probes_in_sight
 from warp_gi.techniques.light_field_places import (
     INSET,
@@ -479,13 +479,28 @@ def test_where_too_few_probes_see_what_these_know_is_not_added(monkeypatch, mode
     assert abs(indirect(scene, spp=256, mode=mode, **SMALL).mean() / truth - 1) < 0.02
 
 
-def test_far_from_the_grid_its_light_counts_for_nothing():
-    """Open ground without a wall: a bake for a lamp's surroundings, and the dark ground thirty metres on."""
+def lamp_in_the_open():
+    """A lamp and a wall on open ground, and a camera that sees just these."""
     ground = quad((-50, 0, 50), (100, 0, 0), (0, 0, -100), gi.Material("ground", (0.7,) * 3, specular=0.0))
     lamp = sphere((0, 0.6, 0), 0.3, gi.Material("lamp", (0.7,) * 3, specular=0.0, emission=(20, 20, 20)))
     wall = quad((1.5, 0, 2), (0, 0, -4), (0, 3, 0), gi.Material("wall", (0.7,) * 3, specular=0.0))
     scene = gi.Scene([gi.Node("all", [ground, lamp, wall])])
-    near = gi.Camera.look_at((-2, 2, 2), (0.5, 0.5, 0), hfov=40, resolution=(16, 12))
+    return scene, gi.Camera.look_at((-2, 2, 2), (0.5, 0.5, 0), hfov=40, resolution=(16, 12))
+
+
+def test_surfels_far_from_the_grid_take_none_of_its_light():
+    """What probes see of ground 15 m away and more is dark, as it is; not lit like the ground between the probes."""
+    scene, near = lamp_in_the_open()
+    bake = gi.bake(scene, gi.LightFieldProbes(counts=(3, 2, 3), resolution=64, rays=4), camera_path=near)
+    distances = unpack_distance(bake.arrays["surfels"]).astype(np.float64)
+    light = unpack_radiance(bake.arrays["radiance"]).mean(axis=-1)
+    far = (distances > 15) & np.isfinite(distances)
+    assert far.sum() > 500 and light[far].mean() < 0.01 * light[distances < 2].mean()
+
+
+def test_far_from_the_grid_its_light_counts_for_nothing():
+    """Open ground without a wall: a bake for a lamp's surroundings, and the dark ground thirty metres on."""
+    scene, near = lamp_in_the_open()
     far = gi.Camera.look_at((-30, 1.5, 1), (-32, 0, 0), hfov=40, resolution=(16, 12))
     settings = {"counts": (3, 2, 3), "resolution": 32, "mode": "irradiance"}
     bake = gi.bake(scene, gi.LightFieldProbes(**settings), camera_path=near)
