@@ -2,6 +2,6 @@
 
 import sys
 
-from warp_gi.cli import main
+from warp_gi.cli.main import main
 
 sys.exit(main(["bench", *sys.argv[1:]]))

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 import warp_gi as gi
-from warp_gi.bench.mitsuba_peer import load_mitsuba, to_mitsuba
-from warp_gi.bench.stages import LAMBERT, PLAIN, Case
+from warp_gi.bench.harness.stages import LAMBERT, PLAIN, Case
+from warp_gi.bench.peers.mitsuba_peer import load_mitsuba, to_mitsuba
 from warp_gi.errors import unknown_name
-from warp_gi.exr import write_exr
+from warp_gi.sequence.exr import write_exr
 
-FOLDER = Path(__file__).resolve().parents[1] / "tests" / "reference"
+FOLDER = Path(__file__).resolve().parents[1] / "tests" / "truth" / "reference"
 SIZE = (72, 40)
 """Width and height of the pictures."""
 

@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 
 import warp_gi as gi
-from warp_gi.bench import runner
-from warp_gi.bench.places import PLACES
-from warp_gi.cli_report import start_warp
+from warp_gi.bench.harness import runner
+from warp_gi.bench.harness.places import PLACES
+from warp_gi.cli.report import start_warp
 from warp_gi.errors import GiError, OptionError, unknown_name
-from warp_gi.exr import stored_values
 from warp_gi.files import check_writable, replacing
-from warp_gi.preview import tone_map, write_png
+from warp_gi.sequence.exr import stored_values
+from warp_gi.sequence.preview import tone_map, write_png
 
 ROOT = runner.FOLDER.parent
 WIDTH, SPP = 480, 64

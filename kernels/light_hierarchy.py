@@ -4,7 +4,7 @@ Conty Estevez and Kulla 2018, "Importance Sampling of Many Lights with Adaptive 
 eight children wide. The lights of one or more triangles, points or spots below a child are known by the sphere around
 their box, a cone that holds the directions they face (half angle theta_o), how far beyond it they shine (theta_e), and
 their power: the sum of their peak intensities (luminance, W/sr). Directional lights stand beside the tree, in a list.
-Trees come from ``warp_gi.techniques.light_tree``.
+Trees come from ``warp_gi.techniques.light_hierarchy.tree``.
 """
 
 import warp as wp

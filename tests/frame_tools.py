@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from warp_gi.camera import Camera
+from warp_gi.scene.camera import Camera
 
 
 def make_frame(index=3, width=24, height=16, seed=5, spp=8, peak=4.0):

@@ -9,10 +9,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from warp_gi.baking import Bake
-    from warp_gi.camera import Camera, CameraPath
+    from warp_gi.scene.camera import Camera, CameraPath
     from warp_gi.scene.scene import Scene
     from warp_gi.scheduler import Frame
-    from warp_gi.techniques.sample_octree import Lesson
+    from warp_gi.techniques.reuse.sample_octree import Lesson
 
 
 class SamplerInUse(NamedTuple):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from warp_gi.errors import OptionError
-from warp_gi.preview import decode_srgb
+from warp_gi.sequence.preview import decode_srgb
 
 RELATIVE_EPSILON = 1e-2
 PIXELS_PER_DEGREE = 67.02064

@@ -10,13 +10,13 @@ from typing import Any
 from warp_gi.denoise import Denoiser, Oidn, SpatioTemporal, denoiser_named
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.estimator import Estimator
-from warp_gi.techniques.baselines import BsdfPaths, PowerLights, TracedEnvironment, UniformLights
-from warp_gi.techniques.guided_paths import GuidedPaths
-from warp_gi.techniques.light_field_probes import LightFieldProbes
-from warp_gi.techniques.light_hierarchy import LightHierarchy
-from warp_gi.techniques.sample_octree import SampleOctree
-from warp_gi.techniques.visibility_field import VisibilityField
-from warp_gi.techniques.visibility_light_cache import VisibilityLightCache
+from warp_gi.techniques.light_field.estimator import LightFieldProbes
+from warp_gi.techniques.light_hierarchy.estimator import LightHierarchy
+from warp_gi.techniques.paths.estimators import BsdfPaths, PowerLights, TracedEnvironment, UniformLights
+from warp_gi.techniques.reuse.guided_paths import GuidedPaths
+from warp_gi.techniques.reuse.light_cache import VisibilityLightCache
+from warp_gi.techniques.reuse.sample_octree import SampleOctree
+from warp_gi.techniques.visibility_field.estimator import VisibilityField
 
 __all__ = ["PRESETS", "TERMS", "Estimator", "Pipeline"]
 

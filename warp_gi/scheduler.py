@@ -18,15 +18,15 @@ import warp as wp
 import warp_gi
 from warp_gi import launch
 from warp_gi.baking import Bake, load_bake
-from warp_gi.camera import Camera, CameraPath
 from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.estimator import Ahead, Estimator, SamplerInUse
 from warp_gi.kernels import compose, denoise, gbuffer, path_samplers, path_trace, path_tracers, samples, types
 from warp_gi.pipeline import TERMS, Pipeline
 from warp_gi.scene.baked import BakedScene
+from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.scene import Scene
-from warp_gi.sequence_state import Dependence, state_arrays, with_arrays
-from warp_gi.techniques.baselines import BsdfPaths, PowerLights, sky_probability
+from warp_gi.sequence.state import Dependence, state_arrays, with_arrays
+from warp_gi.techniques.paths.estimators import BsdfPaths, PowerLights, sky_probability
 
 MOST_VERTICES = 7  # of a path whose samples are kept: each path has room for as many, so more would keep fewer paths
 _VEC3_BUFFERS = ("beauty", "emission", *TERMS, "albedo", "normal", "position", "variance", "moment1", "moment2")

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from warp_gi.errors import OptionError, SceneError
+from warp_gi.scene.files.images import missing_file
+from warp_gi.scene.files.parts import SceneParts
 from warp_gi.scene.geometry import triangulated
-from warp_gi.scene.images import missing_file
 from warp_gi.scene.model import Material, Mesh, Node
-from warp_gi.scene.parts import SceneParts
 from warp_gi.scene.scene import Scene
 
 EXTENSIONS = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
@@ -67,11 +67,11 @@ def load_scene(
 
 def _read(path: Path, suffix: str) -> SceneParts:
     if suffix in (".glb", ".gltf"):
-        from warp_gi.scene.loading_gltf import read_gltf
+        from warp_gi.scene.files.gltf import read_gltf
 
         return read_gltf(path)
     if suffix == ".obj":
-        from warp_gi.scene.loading_obj import read_obj
+        from warp_gi.scene.files.obj import read_obj
 
         return read_obj(path)
     return _read_single_mesh(path, suffix)

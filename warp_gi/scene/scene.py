@@ -19,7 +19,7 @@ from warp_gi.scene.edits import Edits
 from warp_gi.scene.model import Keyframe, Material, Node, PunctualLight
 
 if TYPE_CHECKING:
-    from warp_gi.camera import Camera
+    from warp_gi.scene.camera import Camera
     from warp_gi.scene.environment import Environment
 
 POSES_FOR_BOUNDS = 33

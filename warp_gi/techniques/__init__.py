@@ -1,1 +1,1 @@
-"""Estimators, one file a technique."""
+"""Techniques, a folder each."""

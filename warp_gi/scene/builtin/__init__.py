@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from warp_gi.errors import unknown_name
 
 if TYPE_CHECKING:
-    from warp_gi.camera import CameraPath
+    from warp_gi.scene.camera import CameraPath
     from warp_gi.scene.scene import Scene
 
 BUILTIN_SCENES = {

@@ -10,7 +10,6 @@ import math
 
 import numpy as np
 
-from warp_gi.camera import Camera, CameraKey, CameraPath
 from warp_gi.scene.builtin import architecture as parts
 from warp_gi.scene.builtin import materials
 from warp_gi.scene.builtin.shapes import (
@@ -24,6 +23,7 @@ from warp_gi.scene.builtin.shapes import (
     quad,
     ribbon_ring,
 )
+from warp_gi.scene.camera import Camera, CameraKey, CameraPath
 from warp_gi.scene.environment import SunSky, as_environment
 from warp_gi.scene.model import Material, Node
 from warp_gi.scene.scene import Scene

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from warp_gi.camera import Camera, CameraKey, CameraPath
 from warp_gi.scene.builtin.materials import lamp, matte
 from warp_gi.scene.builtin.shapes import box, merge, quad
+from warp_gi.scene.camera import Camera, CameraKey, CameraPath
 from warp_gi.scene.model import Node
 from warp_gi.scene.scene import Scene
 

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from warp_gi.camera import Camera, CameraKey, CameraPath
 from warp_gi.scene.builtin import materials
 from warp_gi.scene.builtin import textures as tx
 from warp_gi.scene.builtin.shapes import Shape, box, cylinder, icosphere, merge, placement, tube
+from warp_gi.scene.camera import Camera, CameraKey, CameraPath
 from warp_gi.scene.environment import SunSky, as_environment
 from warp_gi.scene.model import Material, Node
 from warp_gi.scene.scene import Scene

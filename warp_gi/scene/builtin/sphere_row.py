@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from warp_gi.camera import Camera, CameraKey, CameraPath
 from warp_gi.scene.builtin.materials import matte, plain
 from warp_gi.scene.builtin.shapes import quad, uv_sphere
+from warp_gi.scene.camera import Camera, CameraKey, CameraPath
 from warp_gi.scene.environment import SunSky
 from warp_gi.scene.model import Color, Node
 from warp_gi.scene.scene import Scene

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from warp_gi.camera import Camera, CameraKey, CameraPath
 from warp_gi.scene.builtin import architecture as parts
 from warp_gi.scene.builtin import materials
 from warp_gi.scene.builtin.shapes import Shape, box, cylinder, icosphere, lathe, loft, merge, placement, quad, tube
+from warp_gi.scene.camera import Camera, CameraKey, CameraPath
 from warp_gi.scene.environment import SunSky, as_environment
 from warp_gi.scene.model import Node
 from warp_gi.scene.scene import Scene

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from warp_gi.camera import Camera, CameraKey, CameraPath
 from warp_gi.scene.builtin import materials
 from warp_gi.scene.builtin.shapes import Shape, box, merge, placement, quad
+from warp_gi.scene.camera import Camera, CameraKey, CameraPath
 from warp_gi.scene.model import Node
 from warp_gi.scene.scene import Scene
 

@@ -1,0 +1,1 @@
+"""How suites run, measure and record."""

@@ -1,0 +1,174 @@
+"""Finds and runs benchmark suites, prints their rows as tables and writes them as lines of JSON.
+
+A suite is a module of ``suites``, or the module ``suite`` of a folder there, with
+``run(quick: bool, device: str) -> list[dict]``;
+its first docstring line says what it measures. Rows with the same keys make one table. One whose ``run`` also takes
+``gallery`` adds pictures to it. The last row of each is what the whole suite took.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import json
+import os
+import platform
+import subprocess
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from functools import lru_cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from warp_gi import launch
+from warp_gi.bench.harness.gallery import CLOSED, Gallery, call
+from warp_gi.bench.harness.measure import PeakMemory, attempt
+from warp_gi.errors import unknown_name
+from warp_gi.files import replacing
+
+FOLDER = Path(__file__).parents[1] / "suites"
+PACKAGES = ("warp-lang", "numpy", "mitsuba", "embreex", "pyoidn", "OpenImageIO", "bpy")
+ENVIRONMENT = ("quick", "commit", "warp_gi", "python", *PACKAGES, "cpu", "cores", "threads", "device")
+"""Keys of a line of results that say how it was measured."""
+WHOLE = "run"
+"""Table of what a whole suite took; CPU seconds, compilation and memory are of this process alone."""
+
+
+def suites(folder: Path = FOLDER) -> dict[str, str]:
+    """Return the suites and what they measure, by name, without importing them."""
+    found = {}
+    for path in sorted([*folder.glob("*.py"), *folder.glob("*/suite.py")]):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        if any(isinstance(node, ast.FunctionDef) and node.name == "run" for node in tree.body):
+            found[path.parent.name if path.stem == "suite" else path.stem] = (ast.get_docstring(tree) or "").partition(
+                "\n"
+            )[0]
+    return found
+
+
+def run_suite(
+    name: str, quick: bool, device: str, gallery: Gallery = CLOSED, parts: Sequence[str] = ()
+) -> list[dict[str, Any]]:
+    """Run a suite and return its rows, the last of them what it took in this process; pictures go to the gallery.
+
+    ``parts`` are names of the suite's ``PARTS``; none are all. Raises OptionError if there is no suite or part of that
+    name, or no such device.
+    """
+    if name not in (known := suites()):
+        raise unknown_name("benchmark suite", name, known)
+    launch.get_device(device)
+    commit()  # of what runs, whatever is committed meanwhile
+    suite = importlib.import_module(f"warp_gi.bench.suites.{name}" + ".suite" * (FOLDER / name).is_dir())
+    for part in parts:
+        if part not in (known_parts := getattr(suite, "PARTS", {})):
+            raise unknown_name(f"part of suite {name}", part, known_parts)
+    compiled, memory = launch.compile_seconds, PeakMemory()
+    wall, cpu = time.perf_counter(), time.process_time()
+    rows = call(suite.run, quick, device, gallery.of(name), **({"parts": parts} if parts else {}))
+    whole = {"table": WHOLE, "wall s": time.perf_counter() - wall, "cpu s": time.process_time() - cpu}
+    return [*rows, whole | {"compile s": launch.compile_seconds - compiled} | memory.row()]
+
+
+def run_all(quick: bool, device: str, gallery: Gallery = CLOSED) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """Yield (suite, rows) of every suite in turn; what fails is a row that says why.
+
+    Raises OptionError if there is no such device.
+    """
+    launch.get_device(device)
+    for name in suites():
+        yield name, attempt({}, lambda name=name: run_suite(name, quick, device, gallery))
+
+
+def has_failed(rows: Iterable[dict[str, Any]]) -> bool:
+    """Return whether a row says that something failed."""
+    return any("failed" in row for row in rows)
+
+
+def json_lines(suite: str, rows: Sequence[dict[str, Any]], quick: bool, device: str) -> str:
+    """Return each row as a line of JSON, with what is needed to repeat it; ``records.read`` reads them."""
+    return _lines(stamped(suite, rows, quick, device))
+
+
+def stamped(suite: str, rows: Sequence[dict[str, Any]], quick: bool, device: str) -> list[dict[str, Any]]:
+    """Return rows with the suite and the environment that they were measured in."""
+    common = {"suite": suite, "quick": quick, **environment(device)}
+    return [{**common, **row} for row in rows]
+
+
+def write_json_lines(path: Path, suite: str, rows: Sequence[dict[str, Any]], quick: bool, device: str) -> None:
+    """Write ``json_lines`` to a file; raises OSError."""
+    write_lines(path, stamped(suite, rows, quick, device))
+
+
+def write_lines(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write stamped rows to a file, one a line; raises OSError."""
+    with replacing(path) as part:
+        part.write_text(_lines(rows), encoding="utf-8")
+
+
+def _lines(rows: Sequence[dict[str, Any]]) -> str:
+    return "".join(json.dumps(row, default=float) + "\n" for row in rows)
+
+
+def environment(device: str) -> dict[str, Any]:
+    """Return commit, versions, processor and device that a measurement was made with."""
+    import warp_gi
+
+    found = launch.get_device(device)
+    return {
+        "commit": commit(),
+        "warp_gi": warp_gi.__version__,
+        "python": platform.python_version(),
+        **{package: version for package in PACKAGES if (version := _version(package))},
+        "cpu": cpu_model(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "threads": launch.thread_count(),
+        "device": found.name if found.is_cuda else "cpu",
+    }
+
+
+@lru_cache
+def commit() -> str:
+    """Return the commit of the working tree, with "+" if it has changes, as it was when this was first asked.
+
+    "unknown" outside of one, also where another project's tree holds this package.
+    """
+    git = ["git", "-C", str(Path(__file__).parent)]
+    if _printed([*git, "ls-files", "--error-unmatch", Path(__file__).name]) is None:
+        return "unknown"
+    return _printed([*git, "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+"]) or "unknown"
+
+
+def cpu_model() -> str:
+    """Return the processor's name."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return platform.processor() or platform.machine()
+
+
+@lru_cache
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return _blender_version() if package == "bpy" else None
+
+
+def _blender_version() -> str | None:
+    """Return the version of bpy in the Python that is to run Blender, if it is another."""
+    python = os.environ.get("WARP_GI_BLENDER_PYTHON")
+    return python and _printed([python, "-c", "from importlib import metadata; print(metadata.version('bpy'))"])
+
+
+def _printed(arguments: Sequence[str]) -> str | None:
+    """Return what a program prints, or None if it cannot be run or fails."""
+    try:
+        result = subprocess.run(arguments, capture_output=True, text=True, timeout=20)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return result.stdout.strip() if result.returncode == 0 else None

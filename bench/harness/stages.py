@@ -1,0 +1,102 @@
+"""What the benchmarks of estimators share: places that they look at, and stages of a frame that are timed alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+import warp_gi as gi
+from warp_gi.bench.harness import presets
+from warp_gi.bench.harness.measure import Taken, Times, take_turns, timed
+from warp_gi.bench.harness.places import PLACES
+from warp_gi.pipeline import TERMS
+
+LAMBERT: Mapping[str, bool] = {"diffuse": True}
+DARK: Mapping[str, bool] = {"diffuse": True, "emission": False}
+PLAIN: Mapping[str, bool] = {"diffuse": False}
+"""Settings of `presets.peer_scene`."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A place as a suite measures it."""
+
+    place: str
+    """Key in `PLACES`."""
+    name: str = ""
+    """In rows; the place's title if not given."""
+    target: float = 0.0
+    """How many times faster than the baseline the estimator shall be."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Of its estimator, where not the defaults."""
+    materials: Mapping[str, bool] | None = None
+    """What `presets.peer_scene` makes of them; None leaves them as they are."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", self.name or PLACES[self.place].title)
+
+    @property
+    def missing(self) -> str:
+        """What to say if one of the place's files is not there, or nothing."""
+        return PLACES[self.place].missing
+
+    def scene(self) -> gi.Scene:
+        """Return the scene with its materials as they are measured."""
+        scene = PLACES[self.place].scene()
+        return scene if self.materials is None else presets.peer_scene(scene, **self.materials)
+
+    def path(self) -> gi.CameraPath:
+        """Return the place's camera path."""
+        return PLACES[self.place].path()
+
+    def camera(self) -> gi.Camera:
+        """Return the camera of the path's first frame."""
+        return PLACES[self.place].camera()
+
+
+class Stage:
+    """A frame of one term, which can be traced again and again: primary rays and bake are done.
+
+    Stages of one scene, camera, number of samples and seed draw the same samples, so what differs between their
+    pictures is what their estimators make of them. Rays start at what is seen in the middle of a pixel.
+    """
+
+    def __init__(
+        self, scene: gi.Scene, camera: gi.Camera, estimator: Any, spp: int, device: str, bake: Any = None, seed: int = 0
+    ) -> None:
+        terms = dict.fromkeys(TERMS) | {estimator.term: estimator}
+        pipeline = gi.Pipeline(**terms, spp=spp, camera_samples=1)
+        bakes = [bake] if bake is not None else []
+        scheduler = gi.FrameScheduler(scene, camera, pipeline, device, seed=seed, bakes=bakes)
+        self.estimator, self.spp = estimator, spp
+        self.frame = scheduler.frame(0)
+        self.state: Any = scheduler.state(estimator.term)
+        self.picture = self.frame.numpy(estimator.term).copy()
+        self.albedo = self.frame.numpy("albedo").copy()
+
+    def trace(self) -> None:
+        """Do the stage once more; its sums are no picture any more."""
+        self.estimator.trace(self.frame, self.state)
+        if self.frame.wants_paths:
+            self.frame.launch_paths()
+        wp.synchronize_device(self.frame.device)
+
+
+def timed_bake(scene: gi.Scene, estimator: Any, device: str, camera: Any = None) -> tuple[gi.Bake, Times]:
+    """Return what the camera, or path, makes the estimator bake, and seconds without compilation."""
+    return timed(lambda: gi.bake(scene, estimator, device, camera_path=camera))
+
+
+def race(stages: Mapping[str, Stage | Callable[[], Any]], repetitions: int, device: str) -> dict[str, Taken[Any]]:
+    """Return what each stage, or call, took; they take turns."""
+    works = {name: stage.trace if isinstance(stage, Stage) else stage for name, stage in stages.items()}
+    return take_turns({name: lambda index, work=work: work() for name, work in works.items()}, repetitions, device)
+
+
+def rmse(a: np.ndarray, b: np.ndarray | float = 0.0) -> float:
+    """Return the root of the mean squared difference."""
+    return float(np.sqrt(np.mean(np.square(np.asarray(a, np.float64) - b))))

@@ -1,0 +1,1 @@
+"""Other renderers, measured beside this one."""

@@ -1,0 +1,178 @@
+"""Blender Cycles as a peer for whole sequences: the same file, camera path, samples and bounces, on the CPU.
+
+Both get Lambert materials and a constant sky, and no denoiser. Cycles runs in a process of its own, by this Python
+or by the one that WARP_GI_BLENDER_PYTHON names.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import warp_gi as gi
+from warp_gi import launch, metrics
+from warp_gi.bench.harness import presets
+from warp_gi.bench.harness.measure import Row
+from warp_gi.bench.harness.places import PLACES, WHITE
+from warp_gi.sequence.exr import read_exr
+
+PYTHON = os.environ.get("WARP_GI_BLENDER_PYTHON", sys.executable)
+HOW_TO_INSTALL = (
+    "no module bpy; install it with: pip install '.[blender]' (or bpy alone), which has wheels for Python 3.11 "
+    "(bpy 4.2 to 5.0) and 3.13 (bpy 5.1 and later); WARP_GI_BLENDER_PYTHON names another Python that has it"
+)
+SKY = WHITE
+"""W/(m^2 sr)."""
+MAX_DEPTH = 6
+
+
+@dataclass(frozen=True)
+class Job:
+    """A sequence that both render."""
+
+    scene: str
+    """Key of a built-in one in `PLACES`, along its camera path."""
+    frames: int
+    size: tuple[int, int]
+    spp: int
+
+
+FULL, QUICK = Job("atrium", 48, (480, 270), 16), Job("cornell_box", 2, (64, 48), 16)
+
+
+def rows(job: Job) -> list[Row]:
+    """Return a row of speed and likeness, or one that says what is missing or failed."""
+    if not is_installed():
+        return [{"table": "Blender", "scene": job.scene, "skipped": HOW_TO_INSTALL}]
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            return [compare(job, Path(folder))]
+        except subprocess.CalledProcessError as error:
+            lines = (error.stderr or "").strip().splitlines()
+            return [{"table": "Blender", "scene": job.scene, "failed": lines[-1] if lines else str(error)}]
+
+
+def is_installed() -> bool:
+    """Return whether the Python that is to run Blender has bpy."""
+    try:
+        return subprocess.run([PYTHON, "-c", "import bpy"], capture_output=True, check=False).returncode == 0
+    except OSError:  # no such Python
+        return False
+
+
+def compare(job: Job, folder: Path) -> Row:
+    """Render the sequence by both; raises CalledProcessError if one fails."""
+    scene = presets.peer_scene(PLACES[job.scene].scene(), diffuse=True, masks=False)
+    path = PLACES[job.scene].path().at_resolution(*job.size)
+    write_glb(scene, folder / "scene.glb")
+    path.save(folder / "camera.json")
+    ours = _ours(job, folder)
+    theirs = _blender(job, path, folder)
+    last = f"{job.frames - 1:04d}.exr"
+    a, b = (read_exr(folder / name / last)[0] for name in ("ours", "blender"))
+    a, b = a["beauty"].astype(np.float64), next(iter(b.values()))[..., :3].astype(np.float64)
+    row: Row = {"table": "Blender", "scene": job.scene, "pixels": f"{job.size[0]}x{job.size[1]}", "spp": job.spp}
+    row |= {"frames": job.frames, "ours frames a minute": 60 * job.frames / ours}
+    row |= {"blender frames a minute": 60 * job.frames / theirs["wall s"], "faster": theirs["wall s"] / ours}
+    row |= {"blender load s": theirs["load s"], "blender s a frame": float(np.median(theirs["frames"]))}
+    row |= {"means differ": float(a.mean() / b.mean() - 1), "relMSE of tiles": tiles_differ(a, b)}
+    return row | {"blender": theirs["version"]}
+
+
+def tiles_differ(a: np.ndarray, b: np.ndarray, tile: int = 8) -> float:
+    """Return the relMSE between means over tiles of pixels, which have little noise left."""
+    height, width = (size // tile * tile for size in a.shape[:2])
+    means = [x[:height, :width].reshape(height // tile, tile, width // tile, tile, 3).mean(axis=(1, 3)) for x in (a, b)]
+    return metrics.rel_mse(*means)
+
+
+def _ours(job: Job, folder: Path) -> float:
+    size, sky = f"{job.size[0]}x{job.size[1]}", ",".join(map(str, SKY))
+    command = [sys.executable, "-m", "warp_gi.cli", "render", str(folder / "scene.glb"), "--environment", sky]
+    command += ["--camera", str(folder / "camera.json"), "--resolution", size, "--spp", str(job.spp), "--precision"]
+    command += ["float", "--frames", f"0-{job.frames - 1}", "--indirect.max-depth", str(MAX_DEPTH), "--quiet"]
+    command += ["--threads", str(launch.thread_count()), "-o", str(folder / "ours" / "####.exr")]
+    return _timed(command)[0]
+
+
+def _blender(job: Job, path: gi.CameraPath, folder: Path) -> dict[str, Any]:
+    cameras = [path.camera(index) for index in range(job.frames)]
+    (folder / "blender").mkdir()
+    about = {
+        "scene": str(folder / "scene.glb"),
+        "output": str(folder / "blender"),
+        "resolution": job.size,
+        "spp": job.spp,
+        "bounces": MAX_DEPTH - 2,  # direct light is no bounce
+        "threads": launch.thread_count(),
+        "sky": SKY,
+        "cameras": [(camera.world_from_camera.tolist(), math.radians(camera.hfov)) for camera in cameras],
+    }
+    (folder / "job.json").write_text(json.dumps(about), encoding="utf-8")
+    wall, text = _timed([PYTHON, str(Path(__file__).with_name("blender_render.py")), str(folder / "job.json")])
+    found = next(line for line in reversed(text.splitlines()) if line.startswith("{"))
+    return json.loads(found) | {"wall s": wall}
+
+
+def _timed(command: list[str]) -> tuple[float, str]:
+    """Return the wall seconds of a process and what it printed."""
+    started = time.perf_counter()
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return time.perf_counter() - started, done.stdout
+
+
+def write_glb(scene: gi.Scene, path: Path) -> None:
+    """Write a scene at rest with Lambert materials, without normals, as GLB; cameras and sky stay behind."""
+    import pygltflib
+    import trimesh
+    from PIL import Image
+
+    exported, materials = trimesh.Scene(), []
+    for index, node in enumerate(scene.nodes):
+        for mesh in node.meshes:
+            image = mesh.material.base_color_texture
+            name = f"{len(materials)} {mesh.material.name}"
+            materials.append(mesh.material)
+            picture = None if image is None else Image.fromarray(image.pixels[..., :3])
+            look = trimesh.visual.material.PBRMaterial(name=name, baseColorTexture=picture)
+            visual = trimesh.visual.TextureVisuals(uv=mesh.uvs, material=look)
+            body = trimesh.Trimesh(mesh.points, mesh.indices, visual=visual, process=False)
+            exported.add_geometry(body, geom_name=name, transform=_world_from_node(scene, index))
+    exported.export(str(path), file_type="glb", include_normals=False)
+    document = pygltflib.GLTF2().load(str(path))
+    for material in document.materials:
+        _describe(material, materials[int(material.name.split()[0])])
+    used = ["KHR_materials_emissive_strength", "KHR_materials_specular"]
+    document.extensionsUsed = sorted({*(document.extensionsUsed or []), *used})
+    document.save(str(path))
+
+
+def _describe(material: Any, source: gi.Material) -> None:
+    """Set what trimesh rounds to bytes or leaves out."""
+    from pygltflib import PbrMetallicRoughness
+
+    strength = max(*source.emission, 0.0)
+    surface = material.pbrMetallicRoughness = material.pbrMetallicRoughness or PbrMetallicRoughness()
+    surface.baseColorFactor = [*map(float, source.base_color), 1.0]
+    surface.metallicFactor, surface.roughnessFactor = 0.0, 1.0
+    material.doubleSided = bool(source.double_sided)
+    material.extensions = {"KHR_materials_specular": {"specularFactor": float(source.specular)}}
+    if strength:
+        material.emissiveFactor = [float(value / strength) for value in source.emission]
+        material.extensions["KHR_materials_emissive_strength"] = {"emissiveStrength": float(strength)}
+
+
+def _world_from_node(scene: gi.Scene, index: int) -> np.ndarray:
+    node = scene.nodes[index]
+    above = np.eye(4) if node.parent is None else _world_from_node(scene, node.parent)
+    return above @ node.parent_from_node

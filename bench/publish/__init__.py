@@ -1,0 +1,1 @@
+"""Documents made from results: ``python -m warp_gi.bench.publish``."""

@@ -1,0 +1,156 @@
+"""What a region of the README is made of: tables and sentences whose figures are looked up in the results."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from warp_gi.bench.harness import markdown, records
+from warp_gi.errors import OptionError
+
+Only = Mapping[str, Any]
+"""Values that rows must have; one of them, where it is a tuple."""
+ENVIRONMENT = ("quick", "commit", "cpu", "threads", "device", "warp-lang", "mitsuba", "embreex")
+"""What a region says of how its suite was measured; ``docs/results.md`` says all."""
+WIDTH = 120
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A value of the results; their range if several rows have one."""
+
+    key: str
+    """The column."""
+    only: Only = field(default_factory=dict)
+    digits: int = 2
+    """Significant ones, at least."""
+    scale: float = 1.0
+    at_least: float | str | None = None
+    """What a value below is bold: a number, or the column that holds it."""
+    at_most: float | str | None = None
+    table: str | None = None
+    """Where not the table of the whole."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table."""
+
+    header: str
+    figure: Figure
+    unless: Only = field(default_factory=dict)
+    """Rows with these values have nothing to show."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table of a region."""
+
+    header: str
+    """Of the first column."""
+    lines: Mapping[str, Only]
+    """The first column, and which rows of the results its line is of."""
+    columns: tuple[Column, ...]
+    table: str = ""
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph of a region."""
+
+    words: str
+    """With names of figures in braces."""
+    figures: Mapping[str, Figure]
+    table: str = ""
+
+
+@dataclass(frozen=True)
+class Region:
+    """A part of the README that one suite's results make, and a line that tells how they were measured."""
+
+    suite: str
+    parts: tuple[Grid | Text, ...]
+
+
+def region_text(name: str, region: Region, rows: Sequence[records.Row]) -> str:
+    """Return a region as Markdown; raises OptionError where the results have no value for a figure."""
+    source = _Source(name, region.suite, [row for row in rows if row.get("suite") == region.suite])
+    parts = [source.grid(part) if isinstance(part, Grid) else source.paragraph(part) for part in region.parts]
+    return "\n\n".join([*parts, _wrapped(f"<sub>Measured at {source.environment()}.</sub>")])
+
+
+@dataclass(frozen=True)
+class _Source:
+    """The rows that a region is made from."""
+
+    region: str
+    suite: str
+    rows: list[records.Row]
+
+    def grid(self, grid: Grid) -> str:
+        lines = [
+            [label, *(self._cell(column, grid.table, only) for column in grid.columns)]
+            for label, only in grid.lines.items()
+        ]
+        headers = [grid.header, *(column.header for column in grid.columns)]
+        return markdown.table(headers, lines, [False, *(True for _ in grid.columns)])
+
+    def paragraph(self, text: Text) -> str:
+        figures = {key: _shown(figure, self._rows(figure, text.table, {})) for key, figure in text.figures.items()}
+        return _wrapped(text.words.format_map(figures))
+
+    def environment(self) -> str:
+        """Return what the suite was measured with, each thing once."""
+        said: records.Row = {}
+        for key in ENVIRONMENT:
+            found = [one[key] for one in records.environments(self.rows).get(self.suite, []) if key in one]
+            if found:
+                said[key] = any(found) if key == "quick" else ", ".join(dict.fromkeys(map(str, found)))
+        return records.environment_text(said)
+
+    def _cell(self, column: Column, table: str, only: Only) -> str:
+        rows = self._rows(column.figure, table, only)
+        if column.unless and all(_has(row, column.unless) for row in rows):
+            return "none"
+        return _shown(column.figure, rows)
+
+    def _rows(self, figure: Figure, table: str, only: Only) -> list[records.Row]:
+        """Return the rows that have a value of the figure; raises OptionError if there is none."""
+        wanted = {"table": table if figure.table is None else figure.table, **only, **figure.only}
+        found = [
+            row for row in self.rows if _has({"table": ""} | row, wanted) and row.get(figure.key) not in (None, "")
+        ]
+        if not found:
+            said = ", ".join(f"{key} {value!r}" for key, value in wanted.items() if value != "") or "any row"
+            raise OptionError(
+                f"README, region {self.region!r}: the results of suite {self.suite!r} have no value of {figure.key!r}"
+                f" for {said}; `warp-gi bench {self.suite} --json FILE` measures it"
+            )
+        return found
+
+
+def _has(row: records.Row, only: Only) -> bool:
+    return all(row.get(key) in (value if isinstance(value, tuple) else (value,)) for key, value in only.items())
+
+
+def _shown(figure: Figure, rows: Sequence[records.Row]) -> str:
+    values = [row[figure.key] for row in rows]
+    if not all(records.is_number(value) for value in values):
+        return ", ".join(dict.fromkeys(map(str, values)))
+    if figure.scale != 1.0:
+        values = [value * figure.scale for value in values]
+    low, high = (markdown.significant(value, figure.digits) for value in (min(values), max(values)))
+    text = low if low == high else f"{low} to {high}"
+    return f"**{text}**" if any(_is_missed(figure, row) for row in rows) else text
+
+
+def _is_missed(figure: Figure, row: records.Row) -> bool:
+    least, most = (row.get(limit) if isinstance(limit, str) else limit for limit in (figure.at_least, figure.at_most))
+    value = row[figure.key]
+    return (records.is_number(least) and value < least) or (records.is_number(most) and value > most)
+
+
+def _wrapped(text: str) -> str:
+    return textwrap.fill(text, WIDTH, break_long_words=False, break_on_hyphens=False)

@@ -1,0 +1,1 @@
+"""The suite ``dvf``: visibility fields."""

@@ -1,0 +1,1 @@
+"""The suite ``probes``: light field probes."""

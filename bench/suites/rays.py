@@ -1,0 +1,283 @@
+"""Ray queries and tree builds beside Embree 4 (embreex) and Warp's own mesh queries.
+
+All get the same rays and triangles, as NumPy arrays, and one thread each; they take turns in one process and the median
+CPU time counts. "ours" is the batch call, which on large trees traces incoherent rays in Morton order and returns them
+in theirs; "ours in order" is what a query inside a kernel costs. "embree" is its fast mode, which may leak through
+edges; "embree robust", watertight like ours, is what embreex makes by default.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+import warp as wp
+
+from warp_gi import bvh as bvh_module
+from warp_gi import launch
+from warp_gi.bench.harness import presets
+from warp_gi.bench.harness.measure import Row, attempt, median_and_spread, ratio_and_spread, take_turns
+from warp_gi.bench.harness.places import PLACES, Place
+from warp_gi.bvh import TriangleBvh
+from warp_gi.scene.camera import CameraKey
+
+T = TypeVar("T")
+REPETITIONS = 5
+RAYS = 1_000_000
+QUICK_RAYS = 200_000
+QUICK_SCENES = ("living room", "sponza", "atrium")
+NEVER = 1 << 62
+NO_EMBREE = "embreex is not installed: pip install embreex"
+EMBREE = {"embree": False, "embree robust": True}
+CASES = {
+    "living room": "living_room",
+    "sponza": "sponza",
+    "bistro": "bistro",
+    "dragon": "dragon_white",
+    "atrium": "atrium",
+    "street": "street",
+}
+"""Places by their names in rows; primary rays are those of their cameras."""
+PARTS = CASES
+
+
+def run(quick: bool = False, device: str = "cpu", parts: Sequence[str] = ()) -> list[Row]:
+    """Return a row for each scene's builds and one for each kind of ray and query; ``parts`` are scenes.
+
+    ``quick`` takes three scenes and fewer rays. Scenes whose file is missing, and peers that are not installed, give
+    a row that says so.
+    """
+    rows: list[Row] = []
+    for name in parts or (QUICK_SCENES if quick else CASES):
+        rows += attempt({"scene": name}, lambda name=name: scene_rows(name, quick, device))
+    return rows
+
+
+def scene_rows(name: str, quick: bool, device: str) -> list[Row]:
+    """Return the rows of a scene."""
+    place = PLACES[CASES[name]]
+    if place.missing:
+        return [{"scene": name, "skipped": place.missing}]
+    points, indices = load_triangles(place)
+    count = QUICK_RAYS if quick else RAYS
+    rays = {"diffuse": diffuse_rays(points, indices, count), "primary": primary_rays(place.path().keys[0], count)}
+    return compare(name, points, indices, rays, device, 3 if quick else REPETITIONS)
+
+
+def compare(
+    name: str,
+    points: np.ndarray,
+    indices: np.ndarray,
+    batches: dict[str, tuple[np.ndarray, np.ndarray]],
+    device: str = "cpu",
+    repetitions: int = REPETITIONS,
+) -> list[Row]:
+    """Return the rows of one mesh: float32 [vertex, 3] points, int32 [triangle, 3], batches of origins, directions."""
+    found = launch.get_device(device)
+    threads = launch.thread_count()
+    try:
+        launch.set_threads(1)
+        tree, mesh, peers, row = build_all(name, points, indices, device, repetitions)
+        rows = [row]
+        if not peers:
+            rows.append({"table": "builds", "scene": name, "skipped": NO_EMBREE})
+        for kind, (origins, directions) in batches.items():
+            for query in ("any", "closest"):
+                row = {"table": "rays", "scene": name, "triangles": len(indices), "rays": kind, "query": query}
+                row |= race(query, tree, mesh, peers, origins, directions, repetitions)
+                if found.is_cpu and threads > 1:
+                    row |= scaling(tree, query, origins, directions, repetitions)
+                rows.append(row)
+    finally:
+        launch.set_threads(threads)
+    return rows
+
+
+def build_all(name: str, points: np.ndarray, indices: np.ndarray, device: str, repetitions: int) -> tuple:
+    """Return our tree, a wp.Mesh, Embree's scenes by name, and the row of build times (CPU seconds)."""
+    TriangleBvh(points, indices[:100], device)  # compiles
+    row: Row = {"table": "builds", "scene": name, "triangles": len(indices)}
+    builders: dict[str, Callable[[], object]] = {
+        "ours": lambda: TriangleBvh(points, indices, device),
+        "warp": lambda: warp_mesh(points, indices, device),
+    }
+    with suppress(ImportError):
+        builders |= {name: embree_builder(points, indices, robust) for name, robust in EMBREE.items()}
+    turns = {name: _ignoring(build) for name, build in builders.items()}
+    built = take_turns(turns, min(repetitions, 3), device, 1, host=EMBREE)
+    for key, taken in built.items():
+        row |= median_and_spread(f"{key} build s", taken.counting)
+    for key in [name for name in EMBREE if name in built]:
+        row |= ratio_and_spread(f"{key} / ours", built[key].cpu, built["ours"].counting)
+    row["bytes a triangle"] = built["ours"].results[0].memory_bytes / len(indices)
+    results = {key: taken.results[0] for key, taken in built.items()}
+    return results.pop("ours"), results.pop("warp"), results, row
+
+
+def embree_builder(points: np.ndarray, indices: np.ndarray, robust: bool) -> Callable[[], tuple]:
+    """Return what builds Embree's scene and mesh; raises ImportError without embreex."""
+    from embreex import mesh_construction, rtcore_scene
+
+    def build() -> tuple:
+        scene = rtcore_scene.EmbreeScene(robust=robust)
+        mesh = mesh_construction.TriangleMesh(scene, points, indices)
+        scene.run(points[:1], points[:1] + 1.0, query="OCCLUDED")  # commits
+        return scene, mesh
+
+    return build
+
+
+def _ignoring(work: Callable[[], T]) -> Callable[[int], T]:
+    return lambda turn: work()
+
+
+def warp_mesh(points: np.ndarray, indices: np.ndarray, device: str) -> wp.Mesh:
+    """Return a wp.Mesh as fast as Warp makes it."""
+    options = {"bvh_constructor": "sah", "bvh_leaf_size": 4} if launch.get_device(device).is_cpu else {}
+    return wp.Mesh(
+        wp.array(points, dtype=wp.vec3, device=device),
+        wp.array(indices.ravel(), dtype=wp.int32, device=device),
+        **options,
+    )
+
+
+def race(
+    query: str,
+    tree: TriangleBvh,
+    mesh: wp.Mesh,
+    peers: dict[str, tuple],
+    origins: np.ndarray,
+    directions: np.ndarray,
+    repetitions: int,
+) -> Row:
+    """Return million rays a second of each contender and their ratios; agreement is of the hit or of the face."""
+    device = tree.device
+    runners: dict[str, Callable[[], np.ndarray]] = {"ours": lambda: trace(tree, query, origins, directions)}
+
+    def in_order() -> np.ndarray:
+        saved = bvh_module.ORDERED_RAYS
+        bvh_module.ORDERED_RAYS = NEVER
+        try:
+            return trace(tree, query, origins, directions)
+        finally:
+            bvh_module.ORDERED_RAYS = saved
+
+    runners["ours in order"] = in_order
+    name = "OCCLUDED" if query == "any" else "INTERSECT"
+    for key, (scene, _) in peers.items():
+        runners[key] = partial(scene.run, origins, directions, query=name)
+
+    def warp_query() -> np.ndarray:
+        rays = [wp.array(x, dtype=wp.vec3, device=device, copy=False) for x in (origins, directions)]
+        faces = wp.empty(len(origins), dtype=wp.int32, device=device)
+        kernel = warp_any if query == "any" else warp_closest
+        launch.launch(kernel, len(origins), [mesh.id, *rays, faces], device)
+        return faces.numpy()
+
+    runners["warp"] = warp_query
+    turns = {name: _ignoring(run) for name, run in runners.items()}
+    taken = take_turns(turns, repetitions, device.alias, 1, host=EMBREE)
+    rates = {name: [len(origins) / seconds / 1e6 for seconds in one.counting] for name, one in taken.items()}
+    row: Row = {}
+    for key, values in rates.items():
+        row |= median_and_spread(f"{key} Mrays/s", values)
+    for key in (*peers, "warp"):
+        row |= ratio_and_spread(f"ours / {key}", rates["ours"], rates[key])
+        row |= ratio_and_spread(f"in order / {key}", rates["ours in order"], rates[key])
+    row["ours Mrays/wall s"] = len(origins) / taken["ours"].times[0] / 1e6
+    if peers:
+        found, faces = (taken[name].results[0] for name in ("embree", "ours"))
+        row["agree"] = float(((found == 0 if query == "any" else found) == faces).mean())
+    return row
+
+
+def trace(tree: TriangleBvh, query: str, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return 0 or 1 (any) or the face (closest) for each ray."""
+    if query == "any":
+        return tree.occluded(origins, directions).numpy()
+    return tree.intersect(origins, directions).face.numpy()
+
+
+def scaling(tree: TriangleBvh, query: str, origins: np.ndarray, directions: np.ndarray, repetitions: int) -> Row:
+    """Return what two threads do to wall time and to CPU time."""
+
+    def with_threads(count: int, turn: int) -> None:
+        launch.set_threads(count)
+        trace(tree, query, origins, directions)
+
+    taken = take_turns({str(count): partial(with_threads, count) for count in (1, 2)}, repetitions)
+    launch.set_threads(1)
+    row = ratio_and_spread("2 threads faster", taken["1"].wall, taken["2"].wall)
+    return row | ratio_and_spread("2 threads cpu", taken["2"].cpu, taken["1"].cpu)
+
+
+@wp.kernel(enable_backward=False)
+def warp_any(
+    first: wp.int32,
+    mesh: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.int32),
+):
+    i = first + wp.tid()
+    faces[i] = wp.int32(wp.mesh_query_ray_anyhit(mesh, origins[i], directions[i], wp.inf))
+
+
+@wp.kernel(enable_backward=False)
+def warp_closest(
+    first: wp.int32,
+    mesh: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.int32),
+):
+    i = first + wp.tid()
+    query = wp.mesh_query_ray(mesh, origins[i], directions[i], wp.inf)
+    faces[i] = wp.where(query.result, query.face, -1)
+
+
+def load_triangles(place: Place) -> tuple[np.ndarray, np.ndarray]:
+    """Return float32 [vertex, 3] points and int32 [triangle, 3] indices of a place's scene file, or built-in scene."""
+    import trimesh
+
+    if not place.files:
+        geometry = place.scene().data("cpu").geometry
+        return geometry.points.numpy(), geometry.indices.numpy().reshape(-1, 3)
+    mesh = trimesh.load(presets.SCENES / place.files[0], force="mesh", process=False)
+    return np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.int32)
+
+
+def diffuse_rays(points: np.ndarray, indices: np.ndarray, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return cosine-distributed rays from points spread evenly over the surface, on either side, just off it."""
+    rng = np.random.default_rng(seed)
+    a, b, c = (points[indices[:, k]].astype(np.float64) for k in range(3))
+    normals = np.cross(b - a, c - a)
+    areas = np.linalg.norm(normals, axis=1)
+    face = np.searchsorted(np.cumsum(areas) / areas.sum(), rng.random(count)).clip(0, len(indices) - 1)
+    root, along = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
+    origins = (1.0 - root) * a[face] + root * (1.0 - along) * b[face] + root * along * c[face]
+    normal = normals[face] / areas[face, None] * rng.choice([-1.0, 1.0], (count, 1))
+    sphere = rng.normal(size=(count, 3))
+    directions = normal + sphere / np.linalg.norm(sphere, axis=1, keepdims=True)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    offset = 1e-5 * np.linalg.norm(points.max(axis=0) - points.min(axis=0))
+    return (origins + offset * normal).astype(np.float32), directions.astype(np.float32)
+
+
+def primary_rays(case: CameraKey, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return about ``count`` camera rays through pixel centres of a 3:2 picture, row by row."""
+    height = round((count / 1.5) ** 0.5)
+    width = height * 3 // 2
+    right = np.tan(np.radians(case.hfov / 2.0))
+    x, y = np.meshgrid((np.arange(width) + 0.5) / width * 2 - 1, 1 - (np.arange(height) + 0.5) / height * 2)
+    forward = np.subtract(case.target, case.eye)
+    forward /= np.linalg.norm(forward)
+    side = np.cross(forward, (0.0, 1.0, 0.0))
+    side /= np.linalg.norm(side)
+    up = np.cross(side, forward)
+    directions = forward + x[..., None] * right * side + y[..., None] * right * height / width * up
+    directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).reshape(-1, 3).astype(np.float32)
+    return np.tile(np.float32(case.eye), (len(directions), 1)), directions

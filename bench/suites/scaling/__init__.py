@@ -1,0 +1,1 @@
+"""The suite ``scaling``: how time and memory grow."""

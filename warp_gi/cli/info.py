@@ -1,0 +1,95 @@
+"""``warp-gi info``: what a scene holds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from warp_gi.cli.inputs import open_scene
+from warp_gi.cli.options import parse_options
+from warp_gi.cli.report import print_table, start_warp
+from warp_gi.scene.model import Material
+from warp_gi.scene.scene import Scene
+from warp_gi.scene.textures import distinct_textures
+
+
+@dataclass
+class Info:
+    """Print what a scene holds: counts, bounds, materials, textures, lights, cameras and memory."""
+
+    scene: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
+    """A GLB, glTF, OBJ or PLY file, or the name of a built-in scene."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the command."""
+    options = parse_options(Info, "info", arguments)
+    start_warp()
+    scene = open_scene(options.scene)
+    print_table(options.scene, ("what", "value"), summary(scene))
+    print_table(
+        "materials",
+        ("name", "base colour", "metallic", "roughness", "emission", "alpha", "textures"),
+        [_material_row(material) for material in scene.materials],
+    )
+    textures = distinct_textures(scene.materials)
+    if textures:
+        rows = [
+            (t.name, f"{t.pixels.shape[1]}x{t.pixels.shape[0]}", "sRGB" if t.srgb else "linear", *t.wrap)
+            for t in textures
+        ]
+        print_table("textures", ("name", "size", "coding", "wrap u", "wrap v"), rows)
+    if scene.lights:
+        rows = [(light.name, light.kind, _numbers(light.intensity), _numbers(light.position)) for light in scene.lights]
+        print_table("lights", ("name", "kind", "intensity", "position [m]"), rows)
+    if scene.cameras:
+        rows = []
+        for name, camera in scene.cameras.items():
+            rows.append((name, _numbers(camera.position), _numbers(-camera.world_from_camera[:3, 2]), camera.hfov))
+        print_table("cameras", ("name", "position [m]", "direction", "hfov [deg]"), rows)
+    return 0
+
+
+def summary(scene: Scene) -> list[tuple[str, object]]:
+    """Return (what, value) of a scene as a whole."""
+    low, high = scene.bounds
+    meshes = [mesh for node in scene.nodes for mesh in node.meshes]
+    sky = scene.environment
+    return [
+        ("triangles", scene.triangle_count),
+        ("vertices", sum(len(mesh.points) for mesh in meshes)),
+        ("meshes", len(meshes)),
+        ("objects", len(scene.object_names)),
+        ("materials", len(scene.materials)),
+        ("textures", len(distinct_textures(scene.materials))),
+        ("emissive triangles", scene.emitter_count - len(scene.lights)),
+        ("lights without size", len(scene.lights)),
+        ("emitted power [W, luminance]", float(scene.emitter_powers().sum())),
+        ("sky, mean radiance", "none" if sky is None else _numbers(sky.mean_radiance)),
+        ("cameras", len(scene.cameras)),
+        ("animation [s]", scene.duration if scene.is_animated else "none"),
+        ("lowest corner [m]", _numbers(low)),
+        ("highest corner [m]", _numbers(high)),
+        ("memory [MB]", scene.memory_bytes / 1e6),
+        ("hash", scene.hash[:16]),
+    ]
+
+
+def _material_row(material: Material) -> tuple[object, ...]:
+    textures = {
+        "colour": material.base_color_texture,
+        "metal-rough": material.metallic_roughness_texture,
+        "normal": material.normal_texture,
+        "emission": material.emission_texture,
+    }
+    alpha = "opaque" if material.alpha_cutoff is None else f"mask {material.alpha_cutoff:g}"
+    emission = _numbers(material.emission) if any(material.emission) else ""
+    used = ", ".join(name for name, texture in textures.items() if texture is not None)
+    return material.name, _numbers(material.base_color), material.metallic, material.roughness, emission, alpha, used
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return " ".join(f"{float(v) + 0.0:.3g}" for v in values)

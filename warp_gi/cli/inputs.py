@@ -1,0 +1,159 @@
+"""What commands are given: scenes, skies, cameras."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import tyro
+
+from warp_gi.cli.options import flag
+from warp_gi.errors import OptionError, unknown_name
+from warp_gi.scene.builtin import BUILTIN_SCENES, builtin_camera_path, builtin_scene
+from warp_gi.scene.camera import Camera, CameraPath
+from warp_gi.scene.environment import Environment, SunSky, as_environment
+from warp_gi.scene.loading import load_scene
+from warp_gi.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from warp_gi.cli.report import Reporter
+
+DEFAULT_SCENE = "atrium"
+
+
+@dataclass
+class SceneOptions:
+    """What is looked at, under which sky, and from where."""
+
+    scene: Annotated[str, tyro.conf.Positional, flag("[SCENE]", DEFAULT_SCENE)] = ""
+    """A GLB, glTF, OBJ or PLY file, or the name of a built-in scene."""
+    smooth: Annotated[float | None, flag("DEGREES", "flat, as glTF asks")] = None
+    """Smooth normals for meshes of a file that have none, except across edges that bend more than this."""
+    scale: float = 1.0
+    """Metres in one unit of the file."""
+    environment: Annotated[str, flag("SKY", "the scene's own; files: none")] = ""
+    """The sky: a latitude-longitude EXR or HDR file, a radiance R,G,B, sun-sky, or none."""
+    environment_rotation: float = 0.0
+    """Turns the sky about +y, degrees, counter-clockwise seen from above."""
+    environment_scale: float = 1.0
+    """Multiplies the sky's radiance."""
+    sun: SunSky = field(default_factory=SunSky)
+    camera: Annotated[str, flag("PATH", "the built-in path, the file's first camera, or one that sees all")] = ""
+    """A camera path in JSON, the name of a camera in the scene, or of a built-in scene whose path to take."""
+    eye: Annotated[tuple[float, float, float] | None, flag("X Y Z", "use --camera")] = None
+    """Where a still camera stands, metres."""
+    target: Annotated[tuple[float, float, float] | None, flag("X Y Z", "use --camera")] = None
+    """What it looks at."""
+    hfov: Annotated[float | None, flag("DEGREES", "the camera's own; 65 with --eye")] = None
+    """Horizontal field of view of a still camera."""
+
+
+def open_scene(name: str, smooth: float | None = None, scale: float = 1.0) -> Scene:
+    """Return a built-in scene by name, or one from a file (``smooth`` and ``scale`` are those of ``load_scene``)."""
+    if name in BUILTIN_SCENES and not Path(name).is_file():
+        if smooth is not None or scale != 1.0:
+            raise OptionError(f"--smooth and --scale go with a scene from a file; {name} is built in")
+        return builtin_scene(name)
+    if not Path(name).suffix and not Path(name).exists():
+        raise unknown_name("scene", name, BUILTIN_SCENES)
+    return load_scene(name, smooth=smooth, scale=scale)
+
+
+def find_scene(options: SceneOptions) -> Scene:
+    """Return the scene that was asked for, with its sky."""
+    scene = open_scene(options.scene or DEFAULT_SCENE, options.smooth, options.scale)
+    if options.environment:
+        scene.environment = parse_environment(options)
+    elif options.environment_rotation or options.environment_scale != 1.0:
+        raise OptionError("--environment-rotation and --environment-scale go with --environment; give that too")
+    return scene
+
+
+def parse_environment(options: SceneOptions) -> Environment:
+    """Return the sky that ``--environment`` names."""
+    text = options.environment
+    numbers = re.split(r"[,\s]+", text.strip())
+    if text == "none":
+        sky = as_environment(None)
+    elif text == "sun-sky":
+        sky = as_environment(options.sun)
+    elif all(re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", number, re.I) for number in numbers):
+        if len(numbers) not in (1, 3):
+            raise OptionError(f"--environment takes 1 or 3 numbers, got {text!r}; for example 1,0.9,0.8")
+        values = [float(number) for number in numbers]
+        sky = as_environment(tuple(values) if len(values) == 3 else values[0])
+    else:
+        sky = as_environment(text)
+    if options.environment_scale != 1.0:
+        sky = replace(sky, scale=sky.scale * options.environment_scale)
+    return sky.rotated(options.environment_rotation)
+
+
+def find_camera(options: SceneOptions, scene: Scene, report: Reporter) -> Camera | CameraPath:
+    """Return the camera or path that was asked for."""
+    if (options.eye is None) != (options.target is None):
+        raise OptionError("--eye and --target go together; give both")
+    if options.hfov is not None and not 0.0 < options.hfov < 180.0:
+        raise OptionError(f"--hfov must be between 0 and 180 degrees, got {options.hfov:g}")
+    if options.eye is not None:
+        if options.camera:
+            raise OptionError("--camera and --eye exclude each other; give one")
+        return Camera.look_at(options.eye, options.target, hfov=options.hfov or 65.0)
+    camera: Camera | CameraPath
+    if options.camera in scene.cameras:
+        camera = scene_camera(scene, options.camera)
+    elif options.camera.lower().endswith(".json"):
+        camera = CameraPath.load(options.camera)
+    elif options.camera in BUILTIN_SCENES:
+        camera = builtin_camera_path(options.camera)
+    elif options.camera:
+        raise unknown_name("camera", options.camera, [*scene.cameras, *BUILTIN_SCENES, "a .json file"])
+    elif (options.scene or DEFAULT_SCENE) in BUILTIN_SCENES:
+        camera = builtin_camera_path(options.scene or DEFAULT_SCENE)
+    elif scene.name in BUILTIN_SCENES and not scene.triangle_count:  # a bake of it
+        camera = builtin_camera_path(scene.name)
+    elif not scene.triangle_count:
+        raise OptionError("a bake has no camera; give --camera or --eye and --target, inside of the scene")
+    elif scene.cameras:
+        camera = scene_camera(scene, next(iter(scene.cameras)))
+    else:
+        report.line("the scene has no camera: showing all of it from outside; --camera or --eye choose another view")
+        camera = overview(scene, options.hfov or 65.0)
+    if options.hfov is not None:
+        if isinstance(camera, CameraPath):
+            raise OptionError("--hfov goes with a still camera; a camera path has its own field of view")
+        camera = replace(camera, hfov=options.hfov)
+    return camera
+
+
+def has_camera(options: SceneOptions, scene: Scene) -> bool:
+    """Return whether a camera was asked for, or the scene brings one: else ``find_camera`` shows it from outside."""
+    name = options.scene or DEFAULT_SCENE
+    return bool(options.camera or options.eye is not None or scene.cameras or name in BUILTIN_SCENES)
+
+
+def scene_camera(scene: Scene, name: str) -> Camera | CameraPath:
+    """Return a camera of the scene; its path if it moves with a node."""
+    path = CameraPath.from_scene(scene, name)
+    return path if len(path.keys) > 1 else scene.cameras[name]
+
+
+def overview(scene: Scene, hfov: float) -> Camera:
+    """Return a camera that sees the whole scene from outside, from above a corner."""
+    low, high = scene.bounds.astype(np.float64)
+    direction = np.array([0.6, 0.45, 0.66]) / np.linalg.norm([0.6, 0.45, 0.66])
+    distance = scene.radius / math.sin(math.radians(hfov) / 2)
+    center = (low + high) / 2
+    return Camera.look_at(center + distance * direction, center, hfov=hfov)
+
+
+def parse_resolution(text: str) -> tuple[int, int]:
+    """Return (width, height) of "960x540"; raises OptionError for anything else."""
+    match = re.fullmatch(r"\s*(\d+)\s*[xX×]\s*(\d+)\s*", text)
+    if not match or not int(match[1]) or not int(match[2]):
+        raise OptionError(f"resolution {text!r} not understood; write for example 960x540")
+    return int(match[1]), int(match[2])

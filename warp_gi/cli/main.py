@@ -1,0 +1,116 @@
+"""The ``warp-gi`` command: dispatch, errors and exit codes."""
+
+from __future__ import annotations
+
+import importlib
+import io
+import os
+import signal
+import sys
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from warp_gi.errors import GiError, unknown_name
+
+EXIT_ERROR = 2
+EXIT_INTERRUPTED = 130
+
+
+@dataclass(frozen=True)
+class Command:
+    """A subcommand: the module with its ``main(arguments)``, imported when called, and what it does."""
+
+    module: str
+    summary: str
+
+
+COMMANDS = {
+    "render": Command("warp_gi.cli.render", "render a sequence of frames to EXR files, with PNG previews"),
+    "bake": Command("warp_gi.cli.bake", "compute once what an estimator needs, and save it"),
+    "compare": Command("warp_gi.cli.compare", "measure how far a picture is from its reference"),
+    "info": Command("warp_gi.cli.info", "print what a scene holds"),
+    "bench": Command("warp_gi.cli.bench", "run a benchmark suite"),
+}
+
+HELP = """usage: warp-gi COMMAND [OPTIONS]
+
+Precomputed and temporally reused global illumination on the CPU and on CUDA.
+
+commands:
+{commands}
+
+examples:
+  warp-gi render                                     the built-in atrium, with previews, to out/
+  warp-gi render hall.glb --environment city.exr --frames 0-47 --spp 64 -o out/hall.####.exr
+  warp-gi render hall.glb --resume ...               only the frames that are not there yet
+  warp-gi bake hall.glb --cell-size 0.5              once for all skies, to out/hall.dvf.safetensors;
+  warp-gi render hall.glb --pipeline dvf --bake out/hall.dvf.safetensors ...   uses it
+  warp-gi bake hall.glb --technique light-field-probes   indirect light, to out/hall.probes.safetensors
+  warp-gi render out/hall.probes.safetensors         what that bake holds, without the scene
+  warp-gi compare out/hall.0000.exr reference.exr    RMSE, relMSE, PSNR, FLIP and a picture of the difference
+
+`warp-gi COMMAND --help` lists the options of a command. Errors are one line on stderr and exit code 2;
+WARP_GI_DEBUG=1 shows where they came from.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code: 0, 2 after an error, 130 when interrupted."""
+    is_process = arguments is None
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # names in scenes, and ±, where the terminal has no UTF-8
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            return _dispatch(arguments)
+    except BrokenPipeError:  # the reader of our output has gone, as in `warp-gi info x | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except (GiError, OSError, MemoryError) as error:
+        if os.environ.get("WARP_GI_DEBUG", "0") != "0":
+            raise
+        print(f"warp-gi: error: {_one_line(error)}", file=sys.stderr)
+        return EXIT_ERROR
+    except RuntimeError as error:
+        if "Failed to allocate" not in str(error) or os.environ.get("WARP_GI_DEBUG", "0") != "0":
+            raise
+        print(f"warp-gi: error: not enough memory: {_one_line(error)}", file=sys.stderr)  # Warp's own allocators
+        return EXIT_ERROR
+    except KeyboardInterrupt as interrupt:
+        if is_process:  # a second Ctrl-C would break off the interpreter's leaving with a traceback
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+        print(": ".join(["warp-gi: interrupted", *map(str, interrupt.args)]), file=sys.stderr)
+        return EXIT_INTERRUPTED
+
+
+def _dispatch(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        listing = "\n".join(f"  {name:<9} {command.summary}" for name, command in COMMANDS.items())
+        print(HELP.format(commands=listing))
+        return 0 if arguments else EXIT_ERROR
+    if arguments[0] in ("-V", "--version"):
+        from warp_gi import __version__
+
+        print(f"warp-gi {__version__}")
+        return 0
+    if arguments[0] not in COMMANDS:
+        raise unknown_name("command", arguments[0], COMMANDS)
+    return importlib.import_module(COMMANDS[arguments[0]].module).main(arguments[1:])
+
+
+def _show_warning(message: Warning | str, *where: object, **more: object) -> None:
+    print(f"warp-gi: warning: {_one_line(message)}", file=sys.stderr)
+
+
+def _one_line(error: BaseException | str) -> str:
+    if isinstance(error, MemoryError):
+        return f"not enough memory {error}".strip()
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename2 or error.filename}: {error.strerror}"  # of a rename, the target
+    return " ".join(str(error).split())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

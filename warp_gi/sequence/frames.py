@@ -1,0 +1,233 @@
+"""Frames on disk: file names, EXR with metadata, reading back, and what a resumed run may skip.
+
+A frame's file appears by rename once it is complete, so a killed process leaves whole
+files and at most one temporary file beside them. Everything that decides the pixels is
+in the metadata: a file counts as done only if it says what the run would write. Equal runs
+write equal files, except for the stage times.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from warp_gi.errors import OptionError, SceneError
+from warp_gi.files import replacing
+from warp_gi.scene.camera import Camera
+from warp_gi.sequence.exr import Attribute, plain, read_exr, stored_values, write_exr
+from warp_gi.sequence.preview import tone_map, write_png
+
+MOST_FRAMES = 1_000_000
+PREFIX = "warp_gi/"
+TIMES = "warp_gi/seconds/"
+
+
+class FrameLike(Protocol):
+    """What is written of a frame; ``warp_gi.Frame`` and ``FrameFile`` both fit."""
+
+    names: Any
+    index: int
+    time: float
+    camera: Camera
+    timings: Mapping[str, float]
+    metadata: Mapping[str, str | int | float]
+
+    def numpy(self, name: str) -> np.ndarray:
+        """Return a buffer, [height, width] or [height, width, channels]."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFile:
+    """A frame read back from its file."""
+
+    buffers: dict[str, np.ndarray]
+    """float32 [height, width] or [height, width, channels]; identifiers are int32."""
+    formats: dict[str, str]
+    """Stored as "half" or "float", by buffer."""
+    index: int
+    time: float
+    """Seconds."""
+    camera: Camera | None
+    """None in files by other programs."""
+    metadata: dict[str, str | int | float]
+    timings: dict[str, float] = field(default_factory=dict)
+    """Seconds by stage."""
+    attributes: dict[str, Attribute] = field(default_factory=dict)
+    """Every attribute of the file, under its own name."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the buffers."""
+        return tuple(self.buffers)
+
+    def numpy(self, name: str) -> np.ndarray:
+        """Return a buffer by name; raises OptionError if the file has none of that name."""
+        if name not in self.buffers:
+            raise OptionError(f"the file has no layer {name!r} (it has: {', '.join(self.buffers)})")
+        return self.buffers[name]
+
+
+def frame_path(pattern: str | Path, index: int) -> Path:
+    """Return the file of frame ``index``: the last run of ``#`` in the name becomes the zero-padded number.
+
+    A name without ``#`` is returned as it is. Raises OptionError for a negative index.
+    """
+    if index < 0:
+        raise OptionError(f"frame numbers start at 0, got {index}")
+    pattern = Path(pattern)
+    runs = list(re.finditer("#+", pattern.name))
+    if not runs:
+        return pattern
+    start, end = runs[-1].span()
+    return pattern.with_name(f"{pattern.name[:start]}{index:0{end - start}d}{pattern.name[end:]}")
+
+
+def parse_frames(text: str) -> list[int]:
+    """Return the frame numbers of "5", "0-47", "0-47:2" or a comma-separated list of these, in order, each once."""
+    frames: dict[int, None] = {}
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*(\d+)(?:-(\d+)(?::(\d+))?)?\s*", part)
+        first, last, step = (int(g) if g else None for g in match.groups()) if match else (0, -1, 1)
+        if not match or (last is not None and last < first) or step == 0:
+            raise OptionError(f"frames {text!r} not understood; write for example 5, 0-47, 0-47:2 or 1,4,9-12")
+        span = range(first, (first if last is None else last) + 1, step or 1)
+        if len(span) + len(frames) > MOST_FRAMES:
+            raise OptionError(f"frames {text!r} are more than {MOST_FRAMES:,}; render them in parts")
+        frames.update(dict.fromkeys(span))
+    return list(frames)
+
+
+def frame_attributes(
+    index: int,
+    time: float,
+    camera: Camera,
+    metadata: Mapping[str, str | int | float],
+    previous_camera: Camera | None = None,
+    precision: str = "half",
+) -> dict[str, Attribute]:
+    """Return the EXR attributes of a frame, all but its stage times.
+
+    ``worldToCamera`` and ``worldToNDC`` follow the OpenEXR standard: row vectors, a
+    left-handed camera space with x right, y up and z forward; NDC from (0, 0) at the upper
+    left to (1, 1) at the lower right corner of the picture.
+    """
+    world_to_camera, world_to_ndc = camera_matrices(camera)
+    attributes: dict[str, Attribute] = {
+        "frame": int(index),
+        "time": float(time),
+        "hfov": float(camera.hfov),
+        "worldToCamera": world_to_camera,
+        "worldToNDC": world_to_ndc,
+        PREFIX + "precision": precision,
+    }
+    if previous_camera is not None:  # motion is towards it
+        attributes["previousWorldToCamera"] = camera_matrices(previous_camera)[0]
+    for key, value in metadata.items():
+        if plain(value) != "":  # OpenEXR drops empty text
+            attributes[PREFIX + key] = plain(value)
+    return attributes
+
+
+def camera_matrices(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``worldToCamera`` and ``worldToNDC`` as OpenEXR defines them, float32 [4, 4], for row vectors."""
+    forward_z = np.diag([1.0, 1.0, -1.0, 1.0])
+    camera_from_world = forward_z @ np.linalg.inv(camera.world_from_camera)
+    width, height = camera.resolution
+    scale = 0.5 / math.tan(math.radians(camera.hfov) / 2)
+    # x / z and y / z on the picture; the third column only keeps the matrix invertible
+    ndc_from_camera = np.array(
+        [[scale, 0, 0.5, 0], [0, -scale * width / height, 0.5, 0], [0, 0, 1, -1], [0, 0, 1, 0]], np.float64
+    )
+    return camera_from_world.T.astype(np.float32), (ndc_from_camera @ camera_from_world).T.astype(np.float32)
+
+
+def write_frame(frame: FrameLike, pattern: str | Path, precision: str = "half") -> Path:
+    """Write a frame to ``pattern`` with ``####`` replaced by its number, and return the path.
+
+    EXR: every buffer as a named layer, metadata and stage times; ``precision`` "float" stores
+    all of it in full. PNG: the tone-mapped picture. The file appears whole or not at all.
+    Raises OSError when it cannot be written, OptionError for another kind of file.
+    """
+    path = frame_path(pattern, frame.index)
+    if path.suffix.lower() == ".png":
+        return write_preview(frame, path)
+    if path.suffix.lower() != ".exr":
+        raise OptionError(f"cannot write {path.name}: frames are .exr or .png files")
+    previous = getattr(frame, "previous_camera", None)
+    attributes = frame_attributes(frame.index, frame.time, frame.camera, frame.metadata, previous, precision)
+    attributes |= {TIMES + stage: float(seconds) for stage, seconds in frame.timings.items()}
+    buffers = {name: frame.numpy(name) for name in frame.names}
+    with replacing(path) as part:
+        try:
+            write_exr(part, buffers, attributes, precision)
+        except OSError as error:
+            raise OSError(str(error).replace(str(part), str(path))) from error
+    return path
+
+
+def write_preview(frame: FrameLike, path: str | Path, exposure: float = 0.0) -> Path:
+    """Write the tone-mapped beauty as PNG, from the values that the EXR stores; ``exposure`` is in stops."""
+    write_png(path, tone_map(stored_values("beauty", frame.numpy("beauty")), exposure))
+    return Path(path)
+
+
+def read_frame(path: str | Path) -> FrameFile:
+    """Read a frame's buffers and metadata back; raises SceneError when the file is missing or not whole."""
+    buffers, attributes, formats = read_exr(path)
+    metadata = {k[len(PREFIX) :]: v for k, v in attributes.items() if k.startswith(PREFIX) and not k.startswith(TIMES)}
+    timings = {k[len(TIMES) :]: float(v) for k, v in attributes.items() if k.startswith(TIMES)}
+    camera = None
+    if "worldToCamera" in attributes and "hfov" in attributes:
+        height, width = next(iter(buffers.values())).shape[:2]
+        world_from_camera = np.linalg.inv(attributes["worldToCamera"].astype(np.float64).T) @ np.diag([1.0, 1, -1, 1])
+        camera = Camera(world_from_camera, float(attributes["hfov"]), (width, height))
+    return FrameFile(
+        buffers,
+        formats,
+        int(attributes.get("frame", 0)),
+        float(attributes.get("time", 0.0)),
+        camera,
+        metadata,
+        timings,
+        attributes,
+    )
+
+
+def is_whole(path: str | Path, expected: Mapping[str, Attribute] | None = None, camera: Camera | None = None) -> bool:
+    """Return whether ``path`` is a complete, readable frame and, if given, has the ``expected`` attributes."""
+    return why_not_whole(path, expected, camera) is None
+
+
+def why_not_whole(
+    path: str | Path, expected: Mapping[str, Attribute] | None = None, camera: Camera | None = None
+) -> str | None:
+    """Return why ``path`` has to be rendered again, in a few words, or None if it need not be.
+
+    ``expected`` are ``frame_attributes``: the file must have just these, stage times aside. ``camera``
+    gives the resolution.
+    """
+    try:
+        frame = read_frame(path)
+    except (SceneError, OptionError):
+        return "missing" if not Path(path).is_file() else "not whole"
+    size = next(iter(frame.buffers.values())).shape[1::-1]
+    if camera is not None and size != camera.resolution:
+        return f"{size[0]}x{size[1]} instead of {camera.resolution[0]}x{camera.resolution[1]}"
+    if expected is None:
+        return None
+    ours = {*expected, *(PREFIX + key for key in frame.metadata)}
+    for name in sorted(ours):
+        have, want = frame.attributes.get(name), expected.get(name)
+        if isinstance(want, np.ndarray):
+            if have is None or not np.array_equal(have, want.astype(np.float32)):
+                return "another camera" if name.startswith("world") else "another frame before it"
+        elif want is None or have != plain(want):
+            return f"{name.removeprefix(PREFIX)} is {have!r} instead of {None if want is None else plain(want)!r}"
+    return None

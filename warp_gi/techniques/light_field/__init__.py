@@ -1,0 +1,1 @@
+"""Light field probes (light_field_probes.txt)."""

@@ -1,0 +1,273 @@
+"""Light field probes: indirect light from octahedral maps that know what they see (light_field_probes.txt)."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from warp_gi import launch
+from warp_gi.baking import Bake
+from warp_gi.errors import BakeError, OptionError, check_whole, unknown_name
+from warp_gi.estimator import Ahead, Estimator
+from warp_gi.kernels import light_field as field_kernels
+from warp_gi.kernels import light_field_trace as trace_kernels
+from warp_gi.scene.camera import Camera, CameraPath
+from warp_gi.techniques.light_field.places import MOST_PROBES, camera_rows, cameras_of, map_resolution
+from warp_gi.techniques.light_field.state import ProbeState, path_settings, sky_bytes
+
+_MODES = {
+    "irradiance": trace_kernels.MODE_IRRADIANCE,
+    "hybrid": trace_kernels.MODE_HYBRID,
+    "traced": trace_kernels.MODE_TRACED,
+}
+_THROUGH = {"geometry": trace_kernels.RAYS_GEOMETRY, "probes": trace_kernels.RAYS_PROBES}
+VISIBILITIES = {"probes": trace_kernels.VISIBILITY_PROBES, "exact": trace_kernels.VISIBILITY_EXACT}
+_PRIMARIES = ("geometry", "probes")
+_WEIGHTS = ("visibility", "trilinear")
+MOST_RESOLUTION = 1024
+UNSEEN_RAYS = 16
+"""Least rays of a pixel whose surface too few probes see; these are few pixels, and beside the others look noisy."""
+SAME_VIEW = 1e-4
+"""Share of its size by which a number of a camera may differ from that of one that a bake was made for."""
+SETTLED = 0.02
+"""Share of an old state that may be left in the irradiance when a probe counts as refreshed."""
+
+
+@dataclass(frozen=True)
+class LightFieldProbes(Estimator):
+    """Indirect light from a grid of probes that hold radiance, normals and distances all around.
+
+    Biased: by how many probes there are, how finely they look, and by what a probe cannot see. (McGuire et al. 2017,
+    "Real-Time Global Illumination using Precomputed Light Field Probes".)
+    """
+
+    term: ClassVar[str] = "indirect"
+
+    mode: Literal["irradiance", "hybrid", "traced"] = "hybrid"
+    """"irradiance" reads filtered irradiance and has no noise; "hybrid" does so for the diffuse part and traces rays
+    for the glossy one; "traced" traces rays for all."""
+    through: Literal["geometry", "probes"] = "geometry"
+    """What rays are traced through. "geometry": the scene; what they meet is lit by its direct light, sampled, and by
+    the probes' irradiance. "probes": their maps alone, as in the paper, which takes many times as long on a CPU."""
+    visibility: Literal["probes", "exact"] = "probes"
+    """Who tells which of the eight probes around a point see it: their maps, or "exact" shadow rays, for less light
+    behind walls at two or three times the price. Where too few see it rays are traced."""
+    counts: tuple[int, int, int] = (0, 0, 0)
+    """Probes along x, y and z of the box that paths from the camera reach; 0 follows from the spacing."""
+    spacing: float = 0.0
+    """Metres between probes; 0 is a twelfth of the longest side, or as much more as it takes for at most 440 probes, in
+    rooms 100, and 128 if no camera is known."""
+    resolution: int = 0
+    """Texels along a side of a probe's map, a multiple of 16; 0 is 128 for up to 128 probes, 64 for more."""
+    irradiance_resolution: int = 32
+    """Texels along a side of its map of irradiance; the paper has 32 to 128."""
+    rays: int = 2
+    """Rays a texel while baking."""
+    bounces: int = 16
+    """Most passes of light from probes to probes; the first is light that was reflected once."""
+    tolerance: float = 0.002
+    """Relative change of the irradiance below which light bounces no more."""
+    relocate: bool = True
+    """Move probes out of walls, or away from them, by up to half the distance to the next."""
+    weights: Literal["visibility", "trilinear"] = "visibility"
+    """"trilinear" blends the eight probes around a point as if all of them saw it, to compare with."""
+    pixel_rays: int = 0
+    """Rays a pixel in the modes "hybrid" and "traced", at least one a camera sample; 0 is one for each of the
+    pipeline's samples."""
+    update: int = 8
+    """Probes that are refreshed each frame, when the sky turned or something moved."""
+    hysteresis: float = 0.5
+    """Share of its old irradiance that a refreshed probe keeps."""
+    primary: Literal["geometry", "probes"] = "geometry"
+    """"probes" traces the camera's rays through the probes too, which hold all light, not only indirect: no geometry
+    is needed, a bake is enough. Needs a pipeline without other terms, as the preset "probe_view"."""
+
+    def validate(self) -> None:
+        """Raise OptionError for settings out of range."""
+        for name, value, known in (
+            ("mode", self.mode, _MODES),
+            ("primary", self.primary, _PRIMARIES),
+            ("through", self.through, _THROUGH),
+            ("visibility", self.visibility, VISIBILITIES),
+            ("weights", self.weights, _WEIGHTS),
+        ):
+            if value not in known:
+                raise unknown_name(f"{name} of light field probes", value, known)
+        block = int(field_kernels.BLOCK)
+        for name, least, most in (
+            ("resolution", block if self.resolution else 0, MOST_RESOLUTION),
+            ("irradiance_resolution", 4, 128),
+            ("rays", 1, 1024),
+            ("bounces", 1, 1000),
+            ("pixel_rays", 0, 1 << 20),
+            ("update", 0, 1 << 20),
+        ):
+            check_whole(name, getattr(self, name), least, most)
+        if self.resolution % block:
+            raise OptionError(f"resolution must be a multiple of {block}, or 0 (automatic), got {self.resolution}")
+        if not isinstance(self.counts, tuple | list) or len(self.counts) != 3:
+            raise OptionError(f"counts must be three whole numbers, along x, y and z, got {self.counts!r}")
+        for count in self.counts:
+            check_whole("counts", count, 0, 1 << 20)
+        if not (math.isfinite(self.spacing) and self.spacing >= 0):
+            raise OptionError(f"spacing must be 0 (automatic) or metres above it, got {self.spacing}")
+        if self.spacing and all(self.counts):
+            raise OptionError("spacing and counts along every axis contradict each other; give one of them")
+        if not 0 <= self.tolerance < 1:
+            raise OptionError(f"tolerance must be a share of at least 0 and below 1, got {self.tolerance}")
+        if not 0 <= self.hysteresis < 1:
+            raise OptionError(f"hysteresis must be a share of at least 0 and below 1, got {self.hysteresis}")
+
+    # ---- bake ----
+
+    def bake_key(self, scene: Any) -> str:
+        """Return the hash of geometry, materials and lights. A changed sky needs no new bake: probes adapt to it.
+
+        They do so in some frames if it changes while frames are rendered, before the first one else.
+        """
+        return scene.contents_hash
+
+    def bake_settings(self, scene: Any) -> dict[str, Any]:
+        """Return the settings that decide the maps."""
+        names = ("spacing", "resolution", "irradiance_resolution", "rays", "bounces", "tolerance", "relocate")
+        counts = "x".join(str(int(n)) for n in self.counts)
+        return {"counts": counts, "weights": self.weights, **{name: getattr(self, name) for name in names}}
+
+    def bake(
+        self,
+        scene: Any,
+        device: str,
+        seed: int = 0,
+        progress: Callable[[float], None] | None = None,
+        camera: Camera | CameraPath | None = None,
+    ) -> Bake:
+        """Return the probes' maps, for the scene's sky and its pose at time 0.
+
+        The grid is that of ``light_field_places.place_grid``: around what ``camera`` reaches over its whole path, or
+        the scene's own cameras. What it will take is logged before it starts (logger "warp_gi", level INFO).
+        """
+        state = ProbeState(scene, launch.get_device(device), self, seed, camera=camera)
+        state.bake(scene, progress)
+        return state.to_bake(scene)
+
+    def start(self, scene: Any, device: str, bake: Bake | None, seed: int = 0) -> ProbeState:
+        """Return the state of probes that hold a bake; under another sky than its own they are filled again."""
+        target = launch.get_device(device)
+        state = ProbeState(scene, target, self, seed, bake)
+        if scene.triangle_count and not np.array_equal(bake.arrays["sky"], sky_bytes(scene)):
+            state.fill(scene, state.lit_data(scene))
+        state.key = _key(scene, 0.0)
+        return state
+
+    def check_view(self, bake: Bake, camera: Camera | CameraPath) -> None:
+        """Warn if a bake was made for another camera path: where its probes see nothing, rays are traced.
+
+        Raises BakeError for one by a version that did not place probes by cameras.
+        """
+        if "cameras" not in bake.arrays:
+            raise BakeError(
+                "this bake of probes is by an earlier version, whose rough surfaces were too bright: bake it again"
+            )
+        made_for, wanted = bake.arrays["cameras"], camera_rows(cameras_of(camera))
+        known = (
+            np.abs(wanted[:, None] - made_for).max(axis=2)
+            <= SAME_VIEW * np.maximum(np.abs(wanted).max(axis=1), 1)[:, None]
+        )
+        if not known.any(axis=1).all():
+            warnings.warn(
+                f"this bake of probes is {'of another camera path' if len(made_for) else 'of no camera'}: "
+                "where too few of its probes see a surface, rays are traced, with noise: bake for this camera",
+                stacklevel=2,
+            )
+
+    def fitting(self, bake: Bake) -> LightFieldProbes:
+        """Return these settings with those that a bake depends on replaced by its own.
+
+        Raises BakeError for a bake of another technique.
+        """
+        if bake.technique != "LightFieldProbes":
+            raise BakeError(f"expected a bake of LightFieldProbes, got one of {bake.technique}")
+        counts = tuple(int(count) for count in bake.settings["counts"].split("x"))
+        return replace(self, **{**bake.settings, "counts": counts})
+
+    # ---- frames ----
+
+    @property
+    def largest_map(self) -> int:
+        """Texels along a side of the largest map of a probe, if there are many of them."""
+        return max(map_resolution(self.resolution, MOST_PROBES), self.irradiance_resolution)
+
+    @property
+    def makes_primary(self) -> bool:
+        """Whether camera rays are traced through the probes."""
+        return self.primary == "probes"
+
+    def depends_on_past(self, scene: Any, ahead: Ahead | None = None) -> bool:
+        """Return whether the sky changes, as probes begin with that of the first frame, or they follow what moves."""
+        return ahead is None or ahead.sky_changes or (self.update > 0 and scene.is_animated)
+
+    def preprocess(self, frame: Any, state: ProbeState) -> ProbeState:
+        """Refresh some probes, if the sky or a pose is not what they saw."""
+        key = _key(frame.scene, frame.time)
+        if key != state.key:
+            state = state.copied()
+            state.key = key
+            state.pending[:] = self.refreshes_to_settle
+        if self.update and state.pending.any():
+            state = state.copied(with_maps=True)
+            probes = state.take_stale(self.update)
+            state.refresh(frame.scene, state.lit_data(frame.scene), probes)
+        return state
+
+    @property
+    def refreshes_to_settle(self) -> int:
+        """Refreshes of a probe until what it saw before no longer counts, and light has bounced a few times."""
+        fading = math.ceil(math.log(SETTLED) / math.log(self.hysteresis)) if self.hysteresis > 0 else 1
+        return max(fading, 4)
+
+    def trace(self, frame: Any, state: ProbeState) -> None:
+        """Add the light of the current camera sample."""
+        settings = frame.pass_settings
+        query = trace_kernels.ProbeQuery()
+        query.mode, query.through = _MODES[self.mode], _THROUGH[self.through]
+        query.visibility = VISIBILITIES[self.visibility]
+        query.rays, query.first_ray, query.ray_bits = settings.sample_count, settings.first_sample, settings.sample_bits
+        if self.pixel_rays:
+            query.rays, query.first_ray, query.ray_bits = _evenly(self.pixel_rays, settings)
+        unseen = query.rays, query.first_ray, query.ray_bits
+        if (self.pixel_rays or frame.pipeline.spp) < UNSEEN_RAYS:
+            unseen = _evenly(UNSEEN_RAYS, settings)
+        query.unseen_rays, query.first_unseen_ray, query.unseen_ray_bits = unseen
+        query.paths = path_settings(frame.scene)
+        buffers = trace_kernels.ProbeBuffers()
+        buffers.indirect = frame["indirect"]
+        buffers.moment1, buffers.moment2 = frame.moments("indirect")
+        if (lobes := frame.lobes()) is not None:
+            buffers.diffuse, buffers.glossy = lobes
+        data = state.lit_data(frame.scene)
+        inputs = [data, frame.camera_data, settings, state.field, query, frame.hits, buffers]
+        frame.launch_tiled(trace_kernels.trace_probes, inputs)
+
+    def trace_primary(self, frame: Any, state: ProbeState) -> None:
+        """Fill the buffers by what camera rays meet in the probes (light_field_probes.txt, Fig. 20)."""
+        buffers = frame.struct(trace_kernels.ProbeView)
+        inputs = [frame.camera_data, frame.pass_settings, state.field, buffers]
+        frame.launch_tiled(trace_kernels.view_probes, inputs)
+
+
+def _evenly(rays: int, settings: Any) -> tuple[int, int, int]:
+    """Return how many rays a camera sample has, its first, and the bits of their number: so many shared out evenly."""
+    each = -(-rays // settings.camera_samples)
+    return each, settings.camera_sample * each, (each * settings.camera_samples - 1).bit_length()
+
+
+def _key(scene: Any, time: float) -> str:
+    """Return what the light in the probes depends on beside geometry, materials and lights: the sky, and poses."""
+    sky = "" if scene.environment is None else scene.environment.content_hash
+    poses = [scene.world_from_node(index, time).tobytes() for index in range(len(scene.nodes)) if scene.moves(index)]
+    return sky + b"".join(poses).hex()

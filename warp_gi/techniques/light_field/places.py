@@ -1,0 +1,296 @@
+"""Where light field probes stand: the box that the grid fills, and the way out of walls and into the light.
+
+The box is that of what paths from the camera reach, over the whole of its path: all that a picture shows, and what
+lights that over one more surface. Bounds of a scene reach behind its walls, to lamps above the ceiling and to the end
+of its ground; and what is brightly lit may be nowhere near the camera.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warp_gi import launch
+from warp_gi.alias import AliasTable
+from warp_gi.errors import OptionError
+from warp_gi.kernels import light_field_place as kernels
+from warp_gi.kernels import types
+from warp_gi.scene.camera import Camera, CameraPath
+from warp_gi.techniques.paths.estimators import sky_probability
+
+AUTOMATIC_PROBES = 440
+"""Most that there are where neither counts nor spacing are given."""
+ROOM_PROBES, UNSEEN_PROBES = 100, 128
+"""The same in rooms, where more of them come out darker (`bench/NOTES.md`), and where no camera says what is seen."""
+ROOM_SHARE = 0.06
+"""A camera is in a room if fewer of the ways from what it sees, and on from there, lead out of the scene."""
+FEW_RESOLUTION, MANY_RESOLUTION = 128, 64
+"""Texels along a side of a map unless told: of up to ``UNSEEN_PROBES`` probes, and of more."""
+AUTOMATIC_STEPS = 12
+"""Distances between probes along the longest side of the box, if that does not make too many of them."""
+REACH_PATHS, REACH_CAMERAS, LEAST_REACHED = 40_000, 32, 400
+"""Paths that say what a camera reaches, most frames of a camera path that they start in, and points without which they
+say nothing: nearly all of them left the scene."""
+REACH_QUANTILE, REACH_MORE = 0.005, 0.1
+"""Share of the points that may lie outside of the box on each side, for some windows look far; and how far first hits
+among them widen it all the same, in sizes of the box."""
+INSET = 0.3
+"""Distance of the outermost probes from the border, in distances between probes: where points by a wall have a probe
+near and light is as it is in the room. At 0.5 rooms come out 5 to 10 % too bright; at 0.2 grids lose
+light in niches and behind curtains."""
+MOST_PROBES = 1 << 20
+MOST_TEXELS = (1 << 31) - 1
+"""Of all maps together: kernels count them in 32 bits."""
+CLEARANCE = 0.1
+"""Share of the smallest distance between probes that a moved probe keeps from walls."""
+SLABS, LOOKS = 24, 24
+"""Points along each axis, and directions from each, that find out where light is."""
+FREE_SHARE, LIT_SHARE, SLAB_SHARE = 0.25, 0.05, 0.1
+"""A point counts if it sees fewer back faces, and this share of the light of the brighter ones; a slab, with this share
+of the points of the best one."""
+PLACE_LOOKS = 256
+INWARD_STEPS = (0.0, 0.25, 0.5)
+"""Distances between probes that one at the border may move inward along an axis."""
+
+
+@dataclass(frozen=True)
+class ProbeGrid:
+    """Where probes stand: on a regular grid over the scene."""
+
+    low: np.ndarray
+    """float64 [3], metres: probe (0, 0, 0)."""
+    spacing: np.ndarray
+    """float64 [3], metres."""
+    counts: tuple[int, int, int]
+    """Probes along x, y, z."""
+
+    @property
+    def probe_count(self) -> int:
+        """Number of probes."""
+        return math.prod(self.counts)
+
+    def positions(self) -> np.ndarray:
+        """Return float64 [probe, 3], x fastest, then y."""
+        z, y, x = np.meshgrid(*(np.arange(n) for n in self.counts[::-1]), indexing="ij")
+        return self.low + np.stack([x, y, z], axis=-1).reshape(-1, 3) * self.spacing
+
+
+def probe_grid(
+    bounds: np.ndarray, counts: Sequence[int], spacing: float, resolution: int, most: int = AUTOMATIC_PROBES
+) -> ProbeGrid:
+    """Return the grid over ``bounds`` [2, 3] with so many probes along each axis, or so many metres between them.
+
+    Counts of 0 follow from the spacing; without one that is a twelfth of the longest side, or as much more as it takes
+    for no more than ``most`` probes. Raises OptionError for more probes than can be held.
+    """
+    low, high = bounds.astype(np.float64)
+    extent = np.maximum(high - low, 1e-3 * max(float((high - low).max()), 1e-3))  # a flat scene has a little height
+    least = 1 if spacing else 2  # eight probes around every point, unless told otherwise
+    step = spacing or float(extent.max()) / AUTOMATIC_STEPS
+
+    def along(step: float) -> tuple[int, ...]:
+        rounded = round if spacing else math.ceil
+        steps = np.minimum(extent / step, 1e9)
+        return tuple(int(n) or max(least, rounded(e)) for n, e in zip(counts, steps, strict=True))
+
+    if not spacing and not all(counts):
+        while math.prod(along(step)) > most and step < extent.max():
+            step *= 1.01
+    found = along(step)
+    texels = math.prod(found) * resolution**2
+    if math.prod(found) > MOST_PROBES or texels > MOST_TEXELS:
+        raise OptionError(
+            f"{' x '.join(map(str, found))} probes of {resolution} x {resolution} texels are more than the "
+            f"{MOST_PROBES:,} probes or {MOST_TEXELS:,} texels that are supported; use fewer or smaller ones"
+        )
+    numbers = np.array(found)
+    cells = extent / np.where(numbers > 1, numbers - 1 + 2 * INSET, 1.0)
+    return ProbeGrid((low + high) / 2 - cells * (numbers - 1) / 2, cells, found)
+
+
+def place_grid(scene: Any, settings: Any, camera: Camera | CameraPath | None, device: wp.Device) -> ProbeGrid:
+    """Return the grid of a LightFieldProbes for what a camera reaches; without one the scene's own do.
+
+    Where there is none, or none that sees anything, light says what is worth a probe, and there are fewer of them.
+    Raises OptionError for more probes than can be held.
+    """
+    seen = seen_space(scene, cameras_of(camera) or list(scene.cameras.values()), device)
+    if seen is None:
+        box, most = lit_bounds(scene, device), UNSEEN_PROBES
+    else:
+        box, most = seen.bounds, ROOM_PROBES if seen.leaving < ROOM_SHARE else AUTOMATIC_PROBES
+    return probe_grid(box, settings.counts, settings.spacing, settings.largest_map, most)
+
+
+def map_resolution(resolution: int, probes: int) -> int:
+    """Return the texels along a side of a map that a setting of ``resolution`` means for so many probes."""
+    return resolution or (FEW_RESOLUTION if probes <= UNSEEN_PROBES else MANY_RESOLUTION)
+
+
+def cameras_of(camera: Camera | CameraPath | None, every: bool = False) -> list[Camera]:
+    """Return where a camera is over its whole path: in ``every`` frame, or in some evenly over it."""
+    if camera is None:
+        return []
+    if isinstance(camera, Camera):
+        return [camera]
+    count = camera.frame_count
+    frames = np.linspace(0, count - 1, count if every else min(count, REACH_CAMERAS))
+    return [camera.camera(int(frame)) for frame in np.unique(np.round(frames))]
+
+
+def camera_rows(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return what decides what cameras see but for their pictures' shape, float32 [camera, 13]."""
+    rows = [[*camera.world_from_camera[:3].ravel(), camera.hfov] for camera in cameras]
+    return np.array(rows, np.float32).reshape(-1, 13)
+
+
+class Space(NamedTuple):
+    """What paths from a camera reach."""
+
+    bounds: np.ndarray
+    """float64 [2, 3], metres."""
+    leaving: float
+    """Share of the ways from what the paths meet that lead out of the scene."""
+
+
+def seen_space(scene: Any, cameras: Sequence[Camera], device: wp.Device) -> Space | None:
+    """Return the box around what paths from cameras meet; None if that is nothing.
+
+    Points count by one over their distance from the camera: a surface twice as far shows half the detail, and a plane
+    to the horizon, which fills a tenth of a picture, does not stretch the box to a hundred times what stands on it.
+    """
+    from warp_gi.scheduler import camera_data  # the scheduler imports the techniques
+
+    along, points, weights, first = int(kernels.REACH_VERTICES), [], [], []
+    ways = left = 0
+    for number, camera in enumerate(cameras):
+        size = REACH_PATHS // len(cameras)
+        at = wp.zeros(size * along, dtype=wp.vec3, device=device)
+        found = wp.zeros(size * along, dtype=wp.uint8, device=device)
+        inputs = [scene.data(device), camera_data(camera), number + 1, at, found]
+        launch.launch(kernels.follow_paths, size, inputs, device)
+        met = found.numpy().astype(bool)
+        here, then = met.reshape(size, along)[:, :-1], met.reshape(size, along)[:, 1:]
+        ways, left = ways + int(here.sum()), left + int((here & ~then).sum())
+        points.append(at.numpy().astype(np.float64)[met])
+        weights.append(1 / np.maximum(np.linalg.norm(points[-1] - camera.position, axis=1), 1e-3 * scene.radius))
+        first.append((np.arange(len(met)) % along == 0)[met])
+    if sum(map(len, points)) < LEAST_REACHED:
+        return None
+    at, weight, is_first = np.concatenate(points), np.concatenate(weights), np.concatenate(first)
+    box = np.stack([_quantiles(at[:, axis], weight) for axis in range(3)], axis=1)
+    more = REACH_MORE * (box[1] - box[0])
+    seen = at[is_first]
+    low, high = np.maximum(seen.min(axis=0), box[0] - more), np.minimum(seen.max(axis=0), box[1] + more)
+    return Space(np.stack([np.minimum(box[0], low), np.maximum(box[1], high)]), left / max(ways, 1))
+
+
+def _quantiles(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the two values outside of which lies ``REACH_QUANTILE`` of the weight, each."""
+    order = np.argsort(values, kind="stable")
+    share = np.cumsum(weights[order])
+    return np.interp([REACH_QUANTILE * share[-1], (1 - REACH_QUANTILE) * share[-1]], share, values[order])
+
+
+def lit_bounds(scene: Any, device: wp.Device) -> np.ndarray:
+    """Return the box around the space that light reaches, float64 [2, 3], for scenes that no camera looks at.
+
+    Bounds of a room reach behind its walls, to lamps above the ceiling and trees before the window, where probes would
+    be of no use. Of points in them, on a regular grid, those that see few back faces and a good share of the light
+    that points of the same scene see count, and the box is that of the slabs in which there are enough. It is the
+    scene's bounds if nothing is lit, or if there are emitters that move.
+    """
+    bounds = scene.bounds.astype(np.float64)
+    if _lights_move(scene):
+        return bounds
+    at = (np.arange(SLABS) + 0.5) / SLABS
+    share = np.stack(np.meshgrid(at, at, at, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = bounds[0] + share * (bounds[1] - bounds[0])
+    light = _light_at(scene, lit_data(scene, device), points, device)
+    typical = _typical(light)
+    if typical <= 0:
+        return bounds
+    useful = _is_lit(light, typical)
+    if not useful.any():
+        return bounds
+    useful = useful.reshape(SLABS, SLABS, SLABS)
+    box = bounds.copy()
+    for axis in range(3):
+        slab = useful.sum(axis=tuple(other for other in range(3) if other != axis))
+        used = np.flatnonzero(slab >= max(SLAB_SHARE * slab.max(), 1))
+        size = (bounds[1, axis] - bounds[0, axis]) / SLABS
+        box[:, axis] = bounds[0, axis] + size * np.array([used[0], used[-1] + 1])
+    return box
+
+
+def _light_at(scene: Any, data: types.SceneData, points: np.ndarray, device: wp.Device) -> np.ndarray:
+    """Return the light from each of some directions [point, LOOKS]; -1 for those that meet back faces."""
+    array = wp.array(points.astype(np.float32), dtype=wp.vec3, device=device)
+    light = wp.empty(len(points) * LOOKS, dtype=wp.float32, device=device)
+    inputs = [data, array, LOOKS, sky_probability(scene), light]
+    launch.launch(kernels.measure_light, len(light), inputs, device)
+    return light.numpy().reshape(-1, LOOKS).astype(np.float64)
+
+
+def _is_free(light: np.ndarray) -> np.ndarray:
+    return (light < 0).mean(axis=1) < FREE_SHARE
+
+
+def _typical(light: np.ndarray) -> float:
+    """Return the mean light of the brighter points."""
+    free = np.maximum(light[_is_free(light)], 0).mean(axis=1)
+    return float(np.quantile(free, 0.9)) if len(free) else 0.0
+
+
+def _is_lit(light: np.ndarray, typical: float) -> np.ndarray:
+    """Return bool [point]; a single bright direction, which another point may miss, counts no more than others."""
+    return _is_free(light) & (np.clip(light, 0, typical).mean(axis=1) > LIT_SHARE * typical)
+
+
+def relocate(scene: Any, data: types.SceneData, grid: ProbeGrid, field: Any, device: wp.Device) -> None:
+    """Move probes of a LightField out of walls and away from them, by up to half the distance to the next probe.
+
+    Those at the border of the grid that no light reaches, in a niche or behind a wall, move inward to where some does,
+    if it does so near enough.
+    """
+    most, clearance = wp.vec3(*(0.5 * grid.spacing)), CLEARANCE * float(grid.spacing.min())
+    inputs = [data, field, most, clearance, PLACE_LOOKS]
+    launch.launch(kernels.place_probes, grid.probe_count, inputs, device, smallest_slice=1)
+    positions = field.positions.numpy().astype(np.float64)
+    light = _light_at(scene, data, positions, device)
+    typical = _typical(light)
+    counts = np.array(grid.counts)
+    index = np.stack(np.unravel_index(np.arange(grid.probe_count), counts[::-1])[::-1], axis=1)
+    inward = np.where(index == 0, 1, np.where(index == counts - 1, -1, 0)) * (counts > 1)
+    dark = np.flatnonzero(~_is_lit(light, typical) & inward.any(axis=1))
+    steps = np.stack(np.meshgrid(*[INWARD_STEPS] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    steps = steps[np.argsort(np.linalg.norm(steps, axis=1), kind="stable")]
+    if typical <= 0 or not len(dark):
+        return
+    homes = grid.positions()[dark]
+    candidates = homes[:, None] + steps * (inward[dark] * grid.spacing)[:, None]
+    lit = _is_lit(_light_at(scene, data, candidates.reshape(-1, 3), device), typical).reshape(len(dark), -1)
+    moved = lit.any(axis=1)
+    positions[dark[moved]] = candidates[moved, lit[moved].argmax(axis=1)]
+    field.positions = wp.array(positions.astype(np.float32), dtype=wp.vec3, device=device)
+
+
+def _lights_move(scene: Any) -> bool:
+    """Return whether an emitter moves."""
+    emits = [any(max(mesh.material.emission) > 0 for mesh in node.meshes) for node in scene.nodes]
+    carried = {light.node for light in scene.lights}
+    return any(scene.moves(index) and (emits[index] or index in carried) for index in range(len(scene.nodes)))
+
+
+def lit_data(scene: Any, device: wp.Device) -> types.SceneData:
+    """Return the scene's buffers with emitters picked by power, whatever the pipeline's estimator of them does."""
+    data = launch.copied(scene.data(device), types.SceneData)
+    data.emitters = launch.copied(data.emitters, types.Emitters)
+    if scene.emitter_count:
+        data.emitters.alias = AliasTable.build(scene.emitter_powers()).on(device)
+    return data

@@ -1,0 +1,1 @@
+"""Emitters selected by a hierarchy over them."""

@@ -1,0 +1,85 @@
+"""Direct light from emitters that are selected by a hierarchy over them: the baseline of the light cache."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+
+from warp_gi import launch
+from warp_gi.estimator import Estimator, SamplerInUse
+from warp_gi.kernels import light_hierarchy, path_trace
+from warp_gi.techniques.light_hierarchy import tree as light_tree
+
+
+@dataclass(frozen=True)
+class LightHierarchy(Estimator):
+    """Direct light from emitters, selected at every point by how near, bright and turned to it they are. Unbiased.
+
+    A tree over emitters with boxes and orientation cones, eight wide, is descended at random by importance (Conty
+    Estevez and Kulla 2018, "Importance Sampling of Many Lights with Adaptive Tree Splitting", without splitting). It
+    is refit where lights move.
+    """
+
+    term: ClassVar[str] = "emitters"
+
+    def bake_key(self, scene: Any) -> str:
+        """Return a hash of all but the sky."""
+        return scene.contents_hash
+
+    def start(self, scene: Any, device: str, bake: Any, seed: int = 0) -> TreeState | None:
+        """Return the tree over the lights at time 0."""
+        return first_tree(scene, launch.get_device(device))
+
+    def depends_on_past(self, scene: Any, ahead: Any = None) -> bool:
+        """Return False: the tree's shape is that at time 0, and its bounds are those of the frame's lights."""
+        return False
+
+    def preprocess(self, frame: Any, state: TreeState | None) -> TreeState | None:
+        """Bring the tree up to the frame's lights, and give it to the paths."""
+        if state is None:
+            return None
+        state = moved_tree(frame, state)
+        frame.lights = SamplerInUse(light_hierarchy.HIERARCHY_LIGHTS, state.data)
+        return state
+
+    def trace(self, frame: Any, state: Any) -> None:
+        """Ask the shared path launch for this term."""
+        frame.request_paths(path_trace.TERM_EMITTERS)
+
+
+@dataclass(frozen=True)
+class TreeState:
+    """The tree on the host and on the device, and the lights that it is around."""
+
+    tree: light_tree.TreeArrays
+    bounds: light_tree.EmitterBounds
+    data: light_hierarchy.LightTree
+
+
+def first_tree(scene: Any, device: wp.Device) -> TreeState | None:
+    """Return the tree over a scene's lights as they are, at time 0 before the first frame; None if there are none.
+
+    Its shape stays, so that frames do not depend on which of them was the first.
+    """
+    if scene.emitter_count == 0:
+        return None
+    bounds = light_tree.emitter_bounds(scene, scene.data(device))
+    tree = light_tree.build_tree(bounds)
+    return TreeState(tree, bounds, light_tree.to_device(tree, device))
+
+
+def moved_tree(frame: Any, state: TreeState) -> TreeState:
+    """Return the tree with its boxes and cones around the lights of a frame."""
+    if frame.scene.is_animated:
+        bounds = light_tree.emitter_bounds(frame.scene, frame.data)
+        if not _same(bounds, state.bounds):
+            tree = light_tree.refit_tree(state.tree, bounds)
+            return TreeState(tree, bounds, light_tree.to_device(tree, frame.device))
+    return state
+
+
+def _same(a: light_tree.EmitterBounds, b: light_tree.EmitterBounds) -> bool:
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("low", "high", "axis"))

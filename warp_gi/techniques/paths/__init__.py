@@ -1,0 +1,1 @@
+"""The baselines: path tracing, and emitters picked by a fixed distribution."""

@@ -1,0 +1,150 @@
+"""Indirect light by paths that go where light came from: directional quadtrees (temporal_reuse.txt, section 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_gi import launch
+from warp_gi.errors import OptionError, check_whole
+from warp_gi.estimator import SamplerInUse
+from warp_gi.kernels import guided_directions, guided_shares, quadtree, quadtree_adapt
+from warp_gi.techniques.paths.estimators import BsdfPaths
+from warp_gi.techniques.reuse.sample_octree import Lesson
+
+BITS = (32, 64, 96, 128)
+
+
+@dataclass(frozen=True)
+class GuidedPaths(BsdfPaths):
+    """Indirect light by path tracing, whose directions also come from a quadtree that each region learns.
+
+    A quadtree of a few bits holds where light came from in the frames before; directions by it and by the BSDF are
+    combined by the balance heuristic. Unbiased but for ``max_depth`` and ``clamp``. Every path vertex uses it.
+    """
+
+    term: ClassVar[str] = "indirect"
+
+    bits: int = 128
+    """Of one quadtree: 32, 64, 96 or 128."""
+    migrations: int = 8
+    """Leaves of a quadtree that may move in a frame; 1 in the paper."""
+    significance: float = 0.5
+    """Leaves move only where what there is to gain by splitting one, times this, exceeds what is lost by giving up
+    four: area times squared light."""
+    fading: float = 0.5
+    """Share that the light of earlier frames keeps in what a quadtree adapts to, more where samples are few; 0 is the
+    last frame alone."""
+    bsdf_share: float = 0.5
+    """Share of directions by the BSDF: the first one, and the only one unless ``adapts_share``."""
+    adapts_share: bool = True
+    """Whether each region learns the share that its samples would have varied least with."""
+    stratified: bool = True
+    """Whether two numbers are warped top-down, which keeps them stratified, or a third picks a leaf as in the paper."""
+    samples: int = 2048
+    """Samples a region that are looked at, each frame."""
+
+    def validate(self) -> None:
+        """Raise OptionError for settings out of range."""
+        super().validate()
+        if self.bits not in BITS:
+            raise OptionError(f"bits must be one of {', '.join(map(str, BITS))}, got {self.bits}")
+        for name, least, most in (("bits", 32, 128), ("migrations", 0, 32), ("samples", 1, 1 << 24)):
+            check_whole(name, getattr(self, name), least, most)
+        if not 0.0 <= self.fading < 1.0:
+            raise OptionError(f"fading must be from 0 to below 1, got {self.fading}")
+        if not 0.0 <= self.significance <= 1.0:
+            raise OptionError(f"significance must be from 0 to 1, got {self.significance}")
+        if not 0.02 <= self.bsdf_share <= 0.98:
+            raise OptionError(f"bsdf_share must be from 0.02 to 0.98, got {self.bsdf_share}")
+
+    @property
+    def learns(self) -> bool:
+        """Regions are learnt from samples."""
+        return True
+
+    def bake_key(self, scene: Any) -> str:
+        """Return a hash of all but the sky."""
+        return scene.contents_hash
+
+    def start(self, scene: Any, device: str, bake: Any, seed: int = 0) -> GuideState:
+        """Return even quadtrees for the eight leaves of the first octree."""
+        device = launch.get_device(device)
+        guides = _guides(8, self.bits, device)
+        guides.trees.fill_(wp.vec4ui(*quadtree.quadtree_uniform(self.bits)))
+        guides.shares.fill_(wp.vec2(self.bsdf_share, self.bsdf_share))
+        return self._counted(guides, device)
+
+    def preprocess(self, frame: Any, state: GuideState) -> GuideState:
+        """Give paths the quadtrees."""
+        data = guided_directions.GuidedDirections()
+        data.bits, data.stratified = self.bits, int(self.stratified)
+        data.trees, data.shares, data.counts = state.guides.trees, state.guides.shares, state.counts
+        data.anchors = state.guides.anchors
+        frame.directions = SamplerInUse(guided_directions.GUIDED_DIRECTIONS, data)
+        return state
+
+    def learn(self, lesson: Lesson, state: GuideState) -> GuideState:
+        """Adapt the quadtrees to the samples of the frame."""
+        device = lesson.device
+        if lesson.octree.leaf_count * 4 * self.bits >= 1 << 31:
+            raise OptionError(
+                f"{lesson.octree.leaf_count:,} leaves are too many for {self.bits} bits; raise octree.split"
+            )
+        guides = _guides(lesson.octree.leaf_count, self.bits, device)
+        uniform = wp.vec4ui(*quadtree.quadtree_uniform(self.bits))
+        cells = [lesson.octree.octree, lesson.tree]
+        inputs = [lesson.origins, state.guides, guides, uniform, self.bsdf_share, *cells]
+        lesson.launch(guided_shares.take_over_guides, inputs)
+        samples = lesson.leaf_samples(self.samples)
+        inputs = [samples, lesson.records, guides, *cells, self.bsdf_share, int(self.adapts_share)]
+        lesson.launch(guided_shares.adapt_shares, inputs)
+        adaptation = self._adaptation(guides, device)
+        adaptation.octree = lesson.octree.octree
+        records = quadtree_adapt.QuadtreeSamples()
+        records.starts, records.counts, records.order = samples.starts, samples.counts, samples.order
+        for name in ("codes", "directions", "contributions", "pdfs"):
+            setattr(records, name, getattr(lesson.records, name))
+        lesson.launch(quadtree_adapt.adapt_quadtrees, [records, adaptation])
+        return GuideState(guides, adaptation.counts)
+
+    def _adaptation(self, guides: guided_shares.GuideKnowledge, device: wp.Device) -> quadtree_adapt.QuadtreeAdaptation:
+        leaves = guides.trees.shape[0]
+        adaptation = quadtree_adapt.QuadtreeAdaptation()
+        adaptation.bits, adaptation.migrations = self.bits, self.migrations
+        adaptation.significance, adaptation.most_samples = self.significance, self.samples
+        adaptation.trees, adaptation.anchors = guides.trees, guides.anchors
+        adaptation.counts = wp.empty(leaves * self.bits // 4, dtype=wp.uint32, device=device)
+        adaptation.energies, adaptation.fading = guides.energies, self.fading
+        return adaptation
+
+    def _counted(self, guides: guided_shares.GuideKnowledge, device: wp.Device) -> GuideState:
+        """Return the state of quadtrees as they are."""
+        adaptation = self._adaptation(guides, device)
+        none = quadtree_adapt.QuadtreeSamples()
+        leaves = guides.trees.shape[0]
+        none.starts = none.counts = wp.zeros(leaves, dtype=wp.int32, device=device)
+        launch.launch(quadtree_adapt.adapt_quadtrees, leaves, [none, adaptation], device)
+        return GuideState(guides, adaptation.counts)
+
+
+@dataclass
+class GuideState:
+    """What every region knows of directions."""
+
+    guides: guided_shares.GuideKnowledge
+    counts: wp.array
+    """uint32 [leaf * bits / 4], which follows from the trees."""
+
+
+def _guides(leaves: int, bits: int, device: wp.Device) -> guided_shares.GuideKnowledge:
+    guides = guided_shares.GuideKnowledge()
+    guides.trees = wp.empty(leaves, dtype=wp.vec4ui, device=device)
+    guides.shares = wp.empty(leaves, dtype=wp.vec2, device=device)
+    guides.moments = wp.zeros(2 * leaves, dtype=guided_shares.ShareMoments, device=device)
+    guides.anchors = wp.zeros(leaves, dtype=wp.vec4, device=device)
+    guides.nearness = wp.zeros(leaves, dtype=wp.vec2, device=device)
+    guides.energies = wp.zeros(leaves * 4 * bits, dtype=wp.float32, device=device)
+    return guides

@@ -1,0 +1,249 @@
+"""Direct light from emitters that were seen lately: the visibility light cache (temporal_reuse.txt, section 4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+
+from warp_gi import launch
+from warp_gi.alias import AliasTable
+from warp_gi.errors import OptionError, check_whole, unknown_name
+from warp_gi.estimator import Estimator, SamplerInUse
+from warp_gi.kernels import light_cache, light_cache_build, light_cache_native, path_trace, types
+from warp_gi.techniques.light_hierarchy.estimator import TreeState, first_tree, moved_tree
+from warp_gi.techniques.reuse.sample_octree import Lesson, running_sums
+from warp_gi.techniques.shared.ltc import ltc_table
+
+EXPLORES_BY = ("hierarchy", "table")
+LEAST_EXPLORATION, MOST_EXPLORATION = 0.05, 0.75
+MOVING_EXPLORATION = 0.3  # least share in a frame whose lights are not where they were
+MOST_EMITTERS = 1 << 23  # entries of lists have 23 bits for them
+
+
+@dataclass(frozen=True)
+class VisibilityLightCache(Estimator):
+    """Direct light from emitters, of which each region samples those that it or a neighbour of it saw lately.
+
+    Lights are selected by what they reflect at the very point: the closed-form cosine integral of their triangle, and
+    linearly transformed cosines for GGX; and by how often they are seen. With a share of samples another light is
+    explored. Where a region's points see more lights than its cache can hold, as under a wall of thousands of equal
+    ones, it learns that selecting by the hierarchy alone varies less, and does so. Unbiased. Every path vertex uses it.
+    """
+
+    term: ClassVar[str] = "emitters"
+
+    capacity: int = 32
+    """Lights a bucket at most, 1 to 32; more lights go to more buckets, of which a sample weighs one."""
+    exploration: float = 0.1
+    """Share of samples that also explore, in (0, 1): the first one, and the only one unless ``adapts_exploration``; at
+    least 0.3 then in frames in which a light moves."""
+    adapts_exploration: bool = True
+    """Whether each region learns the share, from 0.05 to 0.75: by what exploring brings of what varies; and where only
+    to explore, without a sample of the cache, varies less than both together."""
+    memory: int = 8
+    """Frames that a light stays in a region after it was last seen, 0 to 200."""
+    explores_by: str = "hierarchy"
+    """How lights are explored: by the "hierarchy" over all of them, or by a "table" of the three weights below, as in
+    the paper, the same at every point."""
+    energy: float = 1.0
+    """Weight of a light's power in exploration by the table."""
+    change: float = 1.0
+    """Weight in the table of how far a light moved, times its power."""
+    distance: float = 1.0
+    """Weight in the table of a light's nearness to the camera."""
+    samples: int = 2048
+    """Samples a region that are looked at, each frame."""
+
+    def validate(self) -> None:
+        """Raise OptionError for settings out of range."""
+        for name, least, most in (
+            ("capacity", 1, light_cache_native.CAPACITY),
+            ("memory", 0, 200),
+            ("samples", 1, 1 << 24),
+        ):
+            check_whole(name, getattr(self, name), least, most)
+        if not 0.0 < self.exploration < 1.0:
+            raise OptionError(f"exploration must be above 0 and below 1, got {self.exploration}")
+        if self.explores_by not in EXPLORES_BY:
+            raise unknown_name("way to explore", self.explores_by, EXPLORES_BY)
+        weights = (self.energy, self.change, self.distance)
+        if not (min(weights) >= 0.0 and max(self.energy, self.distance) > 0.0 and np.isfinite(weights).all()):
+            raise OptionError(
+                f"energy, change and distance must not be negative, and energy or distance above 0, got {weights}"
+            )
+
+    @property
+    def learns(self) -> bool:
+        """Regions are learnt from samples."""
+        return True
+
+    def bake_key(self, scene: Any) -> str:
+        """Return a hash of all but the sky."""
+        return scene.contents_hash
+
+    def start(self, scene: Any, device: str, bake: Any, seed: int = 0) -> CacheState | None:
+        """Return empty caches for the eight leaves of the first octree."""
+        if scene.emitter_count == 0:
+            return None
+        if scene.emitter_count > MOST_EMITTERS:
+            raise OptionError(
+                f"VisibilityLightCache takes up to {MOST_EMITTERS:,} emitters, {scene.name} has "
+                f"{scene.emitter_count:,}; use LightHierarchy"
+            )
+        device = launch.get_device(device)
+        tree = first_tree(scene, device)
+        places, areas = _places(scene.data(device))
+        radiances = scene.emitter_powers() / (np.pi * np.maximum(areas, 1e-30)) * (areas > 0)
+        luminances = launch.on_device(radiances.astype(np.float32), wp.float32, device)
+        return CacheState(self._tables(8, device), _lists(8, device), places, tree, luminances)
+
+    def preprocess(self, frame: Any, state: CacheState | None) -> CacheState | None:
+        """Bring the shapes of lights and the table of exploration up to the frame, and give paths the cache."""
+        if state is None:
+            return None
+        scene, device = frame.scene, frame.device
+        emitters = frame.data.emitters
+        moved = np.zeros(scene.emitter_count)
+        if state.shapes is None or scene.is_animated:
+            places, _ = _places(frame.data)
+            moved = np.linalg.norm(places - state.places, axis=1)
+            shapes = wp.empty(len(places), dtype=light_cache_native.LightShape, device=device)
+            frame.launch(light_cache.shape_lights, [frame.data, state.luminances, shapes], len(places))
+            state = replace(state, places=places, shapes=shapes, emitters=emitters.emitters)
+        if moved.any() and self.adapts_exploration:  # what is known is in doubt
+            tables = launch.copied(state.tables, light_cache.CacheTables)
+            least = min(max(self.exploration, MOVING_EXPLORATION), MOST_EXPLORATION)
+            shares = np.maximum(tables.exploration.numpy(), np.float32(least))
+            tables.exploration = launch.on_device(shares, wp.float32, device)
+            state = replace(state, tables=tables)
+        cache = light_cache.LightCache()
+        cache.shapes, cache.emitters = state.shapes, state.emitters
+        cache.ltc, cache.tables = ltc_table(device), state.tables
+        if self.explores_by == "hierarchy":
+            state = replace(state, tree=moved_tree(frame, state.tree))
+            cache.explores_by_tree, cache.tree = 1, state.tree.data
+        else:
+            emitters.alias = AliasTable.build(self._table(frame, moved, state.places[:, :3])).on(device)
+        frame.lights = SamplerInUse(light_cache.CACHED_LIGHTS, cache)
+        return state
+
+    def _tables(self, leaves: int, device: wp.Device) -> light_cache.CacheTables:
+        """Return tables of regions that know nothing."""
+        tables = light_cache.CacheTables()
+        for name in ("buckets", "offsets"):
+            setattr(tables, name, wp.zeros(leaves, dtype=wp.int32, device=device))
+        tables.items = wp.zeros(0, dtype=wp.int32, device=device)
+        tables.rates = wp.zeros(0, dtype=wp.float32, device=device)
+        tables.chances = wp.zeros(0, dtype=wp.float32, device=device)
+        tables.exploration = wp.full(leaves, self.exploration, dtype=wp.float32, device=device)
+        tables.alone = wp.full(leaves, int(self.adapts_exploration), dtype=wp.int32, device=device)
+        tables.moments = wp.zeros(leaves, dtype=wp.vec2, device=device)
+        tables.excesses = wp.zeros(leaves, dtype=wp.float32, device=device)
+        return tables
+
+    def _table(self, frame: Any, moved: np.ndarray, centers: np.ndarray) -> np.ndarray:
+        """Return the relative probabilities of exploring each light (section 4.3)."""
+        powers = frame.scene.emitter_powers()
+        away = np.linalg.norm(centers - np.asarray(frame.camera.position, np.float64), axis=1)
+        near = 1.0 / (away**2 + (0.02 * frame.scene.radius) ** 2)
+        weights = np.zeros(len(powers))
+        for share, part in ((self.energy, powers), (self.change, powers * moved), (self.distance, near * (powers > 0))):
+            if part.sum() > 0:
+                weights += share * part / part.sum()
+        return weights
+
+    def trace(self, frame: Any, state: Any) -> None:
+        """Ask the shared path launch for this term."""
+        frame.request_paths(path_trace.TERM_EMITTERS)
+
+    def learn(self, lesson: Lesson, state: CacheState | None) -> CacheState | None:
+        """Make the caches of the next frame from the samples of this one."""
+        if state is None:
+            return None
+        device, leaves = lesson.device, lesson.octree.leaf_count
+        settings = light_cache_build.CacheSettings()
+        settings.capacity = self.capacity
+        settings.hysteresis = 0.75
+        settings.first_exploration = self.exploration
+        adapted = (LEAST_EXPLORATION, MOST_EXPLORATION) if self.adapts_exploration else (self.exploration,) * 2
+        settings.least_exploration, settings.most_exploration = adapted
+        settings.may_be_alone = int(self.adapts_exploration)
+        samples, origins = lesson.leaf_samples(self.samples), lesson.origins
+
+        seen = _lists(leaves, device)
+        seen.entries = wp.empty(2 * samples.order.shape[0], dtype=wp.int32, device=device)
+        lesson.launch(light_cache_build.list_seen_lights, [samples, lesson.records.lights, seen])
+        joined = _lists(leaves, device)
+        around = [seen, state.known, lesson.neighbours, origins]
+        lesson.launch(light_cache_build.bound_lists, [*around, joined.counts])
+        joined.offsets, size = running_sums(joined.counts)
+        joined.entries = wp.zeros(size, dtype=wp.int32, device=device)
+        joined.tries = wp.zeros(size, dtype=wp.vec2, device=device)
+        lesson.launch(light_cache_build.join_lights, [*around, joined, self.memory])
+        tables, sizes = (
+            self._tables(leaves, device),
+            wp.empty(leaves, dtype=wp.int32, device=device),
+        )
+        inputs = [settings, samples, lesson.records, joined, origins, state.tables, tables]
+        lesson.launch(light_cache_build.weigh_light_samples, inputs)
+
+        lights = light_cache.LightCache()
+        lights.shapes, lights.emitters = state.shapes, state.emitters
+        importances = wp.empty(size, dtype=wp.float32, device=device)
+        sums = wp.empty(leaves, dtype=wp.float32, device=device)
+        octree = lesson.octree.octree
+        inputs = [lights, octree, lesson.tree, joined, self.capacity, importances, sums]
+        lesson.launch(light_cache_build.rank_lights, inputs)
+        inputs = [settings, joined, importances, origins, state.tables.buckets, tables.buckets, sizes]
+        lesson.launch(light_cache_build.count_buckets, inputs)
+        tables.offsets, size = running_sums(sizes)
+        tables.items = wp.zeros(size, dtype=wp.int32, device=device)
+        tables.rates = wp.zeros(size, dtype=wp.float32, device=device)
+        tables.chances = wp.zeros(size, dtype=wp.float32, device=device)
+        lesson.launch(light_cache_build.fill_buckets, [settings, joined, importances, sums, tables])
+        return replace(state, tables=tables, known=joined)
+
+
+@dataclass
+class CacheState:
+    """The caches of all regions, and where lights were."""
+
+    tables: light_cache.CacheTables
+    known: light_cache_build.LightLists
+    """Every region's lights with the frames since they were seen, of which the tables are made."""
+    places: np.ndarray
+    """float64 [emitter, 6] where each was in the last frame, and how it was turned."""
+    tree: TreeState = field(metadata={"derived": True})
+    """For exploration."""
+    luminances: wp.array = field(metadata={"derived": True})
+    """float32 [emitter] of the mean radiance of emissive triangles, 0 of others."""
+    shapes: wp.array | None = field(default=None, metadata={"derived": True})
+    """LightShape [emitter]; None before the first frame."""
+    emitters: wp.array | None = field(default=None, metadata={"derived": True})
+    """Emitter [emitter] of the scene; None before the first frame."""
+
+
+def _lists(leaves: int, device: wp.Device) -> light_cache_build.LightLists:
+    lists = light_cache_build.LightLists()
+    lists.offsets = wp.zeros(leaves, dtype=wp.int32, device=device)
+    lists.counts = wp.zeros(leaves, dtype=wp.int32, device=device)
+    lists.entries = wp.zeros(0, dtype=wp.int32, device=device)
+    lists.tries = wp.zeros(0, dtype=wp.vec2, device=device)
+    return lists
+
+
+def _places(data: types.SceneData) -> tuple[np.ndarray, np.ndarray]:
+    """Return centre and turn of each emitter, float64 [n, 6], and the area of its emitting sides, 0 without size."""
+    table = data.emitters.emitters.numpy()
+    places = np.concatenate([table["position"], table["direction"]], axis=1).astype(np.float64)
+    areas = np.zeros(len(table))
+    has_size = table["kind"] == types.EMITTER_TRIANGLE
+    triangles = table["triangle"][has_size]
+    points = data.geometry.points.numpy()[data.geometry.indices.numpy()[triangles]].astype(np.float64)
+    places[has_size] = np.concatenate([points.mean(axis=1), points[:, 0]], axis=1)
+    areas[has_size] = np.linalg.norm(np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]), axis=1) / 2
+    areas[has_size] *= 1.0 + data.materials.numpy()["double_sided"][data.geometry.materials.numpy()[triangles]]
+    return places, areas

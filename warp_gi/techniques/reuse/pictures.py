@@ -1,0 +1,273 @@
+"""What techniques that learn from samples know, as pictures: the octree's leaves, lights, shares, and a quadtree."""
+
+from __future__ import annotations
+
+import math
+from numbers import Integral
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_gi import launch
+from warp_gi.alias import AliasTable
+from warp_gi.errors import OptionError
+from warp_gi.kernels import reuse_pictures as kernels
+from warp_gi.kernels import types
+from warp_gi.scene.camera import Camera
+from warp_gi.scheduler import Frame, FrameScheduler, camera_data
+from warp_gi.sequence.preview import magma, to_bytes, write_pngs
+from warp_gi.techniques.light_field.ray import probe_color
+from warp_gi.techniques.light_field.state import low_directions
+from warp_gi.techniques.paths.estimators import TracedEnvironment, sky_probability
+from warp_gi.techniques.reuse.guided_paths import GuidedPaths
+from warp_gi.techniques.reuse.light_cache import VisibilityLightCache
+from warp_gi.techniques.shared.legends import round_above, scale_bar, stacked, with_keys
+
+MAP_TEXELS = 64
+"""Along a side of the map of the light that comes to a point."""
+MAP_RAYS = 128
+"""Of a texel of that map."""
+MAP_PIXELS = 512
+"""Along a side of the maps in the picture."""
+LEAST_DENSITY = 1e-3
+"""1/sr, where the scale of densities begins; the largest leaf of a quadtree of 128 bits has 0.002 at least."""
+NOTHING_COLOR = (255, 255, 255)
+BORDER_COLOR = (0, 130, 130)  # dark turquoise, which magma does not have
+SHADE = np.array([0.37, 0.84, 0.40])
+"""Unit vector towards which surfaces are brightest where leaves are shown."""
+GAP = 8  # pixels between two maps
+
+
+def reuse_pictures(
+    scheduler: FrameScheduler, frame: Frame, folder: str | Path, pixel: tuple[int, int] | None = None
+) -> list[Path]:
+    """Write what is known after a frame as PNG files, those that the pipeline's techniques have; return the paths.
+
+    Pixels show the surface in their middle. leaves.png: each leaf of the octree in a colour of its own. samples.png:
+    samples of the frame in the leaf. With a VisibilityLightCache, lights.png: lights in the leaf's cache, and
+    exploration.png: share of its samples that explore. With GuidedPaths, bsdf_share.png: share of directions by the
+    BSDF, of rough surfaces; and with a pixel quadtree.png: octahedral maps of the light that comes to the point there,
+    path traced, and of the density of its leaf's quadtree (temporal_reuse.txt, Fig. 10).
+
+    Args:
+        scheduler: What rendered the frame, and no frame since.
+        frame: Its last one.
+        folder: Where pictures go; made if missing.
+        pixel: Column and row, (0, 0) at the top left.
+
+    Raises OptionError for a pipeline that learns nothing, a pixel outside of the picture or without a surface.
+    """
+    with scheduler.scene.lock:
+        check_pictures(scheduler, frame.camera, pixel)
+        scheduler.scene.update(frame.time, None, scheduler.device)  # others may have moved it since the frame
+        return write_pngs(folder, _pictures(scheduler, frame, pixel))
+
+
+def _pictures(scheduler: FrameScheduler, frame: Frame, pixel: tuple[int, int] | None) -> dict[str, np.ndarray]:
+    """Return the pictures by name, uint8 [height, width, 3]."""
+    width, height = frame.camera.resolution
+    state = scheduler.state("octree")
+    view = _view(frame.data, frame.camera, state.octree, frame.device)
+    leaves = view.leaves.numpy().reshape(height, width)
+    pictures = {
+        "leaves": _draw_leaves(leaves, view.normals.numpy().reshape(height, width, 3), state, frame.index),
+        "samples": _draw_counts(leaves, state.counts.numpy(), f"samples a leaf, frame {frame.index}"),
+    }
+    if isinstance(scheduler.pipeline.emitters, VisibilityLightCache):
+        known = scheduler.state("emitters")
+        if known is not None:
+            shares, most = known.tables.exploration.numpy().copy(), 1.0
+            shares[known.tables.buckets.numpy() == 0] = 1.0  # where nothing is known, all samples explore
+            pictures["lights"] = _draw_counts(leaves, cached_lights(known.tables), "lights in the cache of a leaf")
+            title = _about(leaves, shares, "share of samples that explore")
+            pictures["exploration"] = _draw_values(leaves, shares, round_above(most), title)
+    if isinstance(scheduler.pipeline.indirect, GuidedPaths):
+        shares = scheduler.state("indirect").guides.shares.numpy()[:, 0]
+        title = _about(leaves, shares, "share of directions by the BSDF, rough surfaces")
+        pictures["bsdf_share"] = _draw_values(leaves, shares, 1.0, title)
+    if pixel is not None:
+        pictures["quadtree"] = _draw_quadtree(scheduler, frame, view, pixel)
+    return pictures
+
+
+def check_pictures(scheduler: FrameScheduler, camera: Camera, pixel: tuple[int, int] | None = None) -> None:
+    """Raise OptionError where ``reuse_pictures`` would, as far as that is known before the frame.
+
+    Whether the pixel has a surface is known where nothing moves.
+    """
+    pipeline = scheduler.pipeline
+    if not scheduler.learns:
+        raise OptionError(
+            "pictures of reuse show what is learnt from samples, and no estimator of this pipeline learns; the preset "
+            '"reuse" does'
+        )
+    if pixel is None:
+        return
+    if not isinstance(pipeline.indirect, GuidedPaths):
+        name = type(pipeline.indirect).__name__
+        raise OptionError(f"the picture of a pixel's quadtree needs GuidedPaths for the indirect light, not {name}")
+    width, height = camera.resolution
+    column, row = pixel
+    if not (isinstance(column, Integral) and isinstance(row, Integral)):
+        raise OptionError(f"pixel must be two whole numbers, column and row, got {pixel!r}")
+    if not (0 <= column < width and 0 <= row < height):
+        raise OptionError(f"pixel ({column}, {row}) is outside of the picture of {width} x {height} pixels")
+    if not scheduler.scene.is_animated:
+        cube = pipeline.octree.start(scheduler.scene, scheduler.device).octree
+        data = scheduler.scene.data(scheduler.device)
+        _check_surface(_view(data, camera, cube, scheduler.device, pixel).leaves.numpy()[0], pixel)
+
+
+def cached_lights(tables: Any) -> np.ndarray:
+    """Return how many lights are in the cache of each leaf, int32 [leaf]."""
+    buckets, offsets, items = (getattr(tables, name).numpy() for name in ("buckets", "offsets", "items"))
+    counts = np.zeros(len(buckets), np.int32)
+    filled = buckets > 0
+    counts[filled] = items[offsets[filled] + buckets[filled] - 1]
+    return counts
+
+
+# ---- what pixels see ----
+
+
+def _view(
+    data: types.SceneData, camera: Camera, octree: Any, device: wp.Device, pixel: tuple[int, int] | None = None
+) -> kernels.LeafView:
+    """Return what the middles of all pixels see, or that of one."""
+    width, height = camera.resolution
+    begin, count = (0, width * height) if pixel is None else (pixel[1] * width + pixel[0], 1)
+    view = kernels.LeafView()
+    view.leaves = wp.empty(count, dtype=wp.int32, device=device)
+    view.origins, view.normals = (wp.zeros(count, dtype=wp.vec3, device=device) for _ in range(2))
+    launch.launch(kernels.view_leaves, count, [data, camera_data(camera), begin, octree, view], device)
+    return view
+
+
+def _check_surface(leaf: int, pixel: tuple[int, int]) -> None:
+    if leaf < 0:
+        raise OptionError(f"pixel ({pixel[0]}, {pixel[1]}) sees no surface, so it is in no region; choose another")
+
+
+# ---- values on surfaces ----
+
+
+def _draw_leaves(leaves: np.ndarray, normals: np.ndarray, state: Any, index: int) -> np.ndarray:
+    """Return the picture of which leaf is where, a little shaded."""
+    masks = state.octree.nodes.numpy() & 255
+    is_leaf = (masks[:, None] >> np.arange(8, dtype=np.uint32) & 1).astype(bool).ravel()
+    seen, where = np.unique(leaves, return_inverse=True)
+    colors = np.array([probe_color(int(leaf)) for leaf in seen]) / 255
+    shade = 0.8 + 0.2 * normals @ SHADE
+    image = to_bytes(colors[where.reshape(leaves.shape)] * shade[..., None])
+    counts = state.counts.numpy()[is_leaf]
+    title = f"{len(counts):,} leaves, {int((seen >= 0).sum()):,} of them in view, {int(counts.sum()):,} samples of"
+    return _with_nothing(image, leaves, f"{title} frame {index}")
+
+
+def _draw_counts(leaves: np.ndarray, counts: np.ndarray, title: str) -> np.ndarray:
+    """Return a picture of counts by leaf."""
+    most = int(counts[leaves[leaves >= 0]].max(initial=0))
+    return _draw_values(leaves, counts, max(most, 1), _about(leaves, counts, title))
+
+
+def _about(leaves: np.ndarray, values: np.ndarray, title: str) -> str:
+    """Return the title with the range of what is in view."""
+    seen = values[np.unique(leaves[leaves >= 0])]
+    return f"{title}: {seen.min():.4g} to {seen.max():.4g} in view" if seen.size else title
+
+
+def _draw_values(leaves: np.ndarray, values: np.ndarray, top: float, title: str) -> np.ndarray:
+    """Return a picture of values by leaf, with their scale from 0 to ``top``."""
+    image = magma(values[np.maximum(leaves, 0)].astype(np.float32) / top)
+    return stacked(_with_nothing(image, leaves), scale_bar(leaves.shape[1], top, title))
+
+
+def _with_nothing(image: np.ndarray, leaves: np.ndarray, title: str = "") -> np.ndarray:
+    """Return the picture of leaves with pixels that see none in a colour of their own, which a legend names."""
+    image = np.where(leaves[..., None] < 0, np.array(NOTHING_COLOR, np.uint8), image)
+    keys = ((NOTHING_COLOR, "no surface"),) if (leaves < 0).any() else ()
+    return with_keys(image, keys, title) if keys or title else image
+
+
+# ---- a quadtree ----
+
+
+def _draw_quadtree(
+    scheduler: FrameScheduler, frame: Frame, view: kernels.LeafView, pixel: tuple[int, int]
+) -> np.ndarray:
+    """Return octahedral maps of the light that comes to a pixel's point and of what its leaf expects, side by side."""
+    item = pixel[1] * frame.camera.resolution[0] + pixel[0]
+    leaf = int(view.leaves.numpy()[item])
+    _check_surface(leaf, pixel)
+    origin, normal = view.origins.numpy()[item], view.normals.numpy()[item].astype(np.float64)
+    light = incident_light(scheduler, frame, origin, normal)
+    densities, cells = quadtree_densities(scheduler, leaf, origin)
+    directions = low_directions(MAP_TEXELS).astype(np.float64)
+    angles = directions[:, 3].reshape(light.shape)
+    reflected = light * np.maximum(directions[:, :3] @ normal, 0.0).reshape(light.shape)
+    total, scale = float((light * angles).sum()), float((reflected * angles).sum())
+    maps = [light / max(total, 1e-30), reflected / max(scale, 1e-30), densities]  # all 1/sr, of integral 1
+    top = 10.0 ** math.ceil(math.log10(max(float(values.max()) for values in maps)))
+    panels = [_heat(values, top) for values in maps]
+    for k in range(2):
+        panels[k] = panels[k].repeat(MAP_PIXELS // MAP_TEXELS, axis=0).repeat(MAP_PIXELS // MAP_TEXELS, axis=1)
+    border = np.zeros(cells.shape, bool)
+    border[:, 1:] |= cells[:, 1:] != cells[:, :-1]
+    border[1:] |= cells[1:] != cells[:-1]
+    panels[2][border] = BORDER_COLOR
+    keys = []
+    for decade in range(round(math.log10(top / LEAST_DENSITY)) + 1):
+        density = LEAST_DENSITY * 10.0**decade
+        (color,) = _heat(np.full((1, 1), density), top)[0].tolist()
+        keys.append((tuple(color), f"{'up to ' * (decade == 0)}{density:g} /sr, {density * total:.2g} W/(m2 sr)"))
+    title = (
+        f"Pixel ({pixel[0]}, {pixel[1]}), frame {frame.index}. Left: luminance of the light that comes to its point, "
+        "path traced, but for what comes straight from emitters. Middle: best density for a Lambert surface there, "
+        f"that light times the cosine. Right: density of its leaf's quadtree, {len(np.unique(cells))} cells in sight. "
+        "All directions, seen from above: +y in the middle, x right, z down."
+    )
+    gap = np.full((MAP_PIXELS, GAP, 3), NOTHING_COLOR, np.uint8)
+    return with_keys(np.concatenate([panels[0], gap, panels[1], gap, panels[2]], axis=1), tuple(keys), title)
+
+
+def _heat(densities: np.ndarray, top: float) -> np.ndarray:
+    """Return densities [1/sr] in the magma colours, on a logarithmic scale from LEAST_DENSITY to ``top``."""
+    share = np.log(np.maximum(densities, LEAST_DENSITY) / LEAST_DENSITY) / math.log(top / LEAST_DENSITY)
+    return magma(share.astype(np.float32))
+
+
+def incident_light(scheduler: FrameScheduler, frame: Frame, origin: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Return the luminance [W/(m^2 sr)] that comes to a point, float64 [MAP_TEXELS, MAP_TEXELS], an octahedral map.
+
+    What emitters send straight there is left out, and what comes from below the surface of the ``normal``. The sky
+    counts if paths find it, not an estimator of another kind.
+    """
+    pipeline, scene = scheduler.pipeline, scheduler.scene
+    data = launch.copied(frame.data, types.SceneData)
+    data.emitters = launch.copied(data.emitters, types.Emitters)
+    if scene.emitter_count:
+        data.emitters.alias = AliasTable.build(scene.emitter_powers()).on(frame.device)
+    incident = kernels.IncidentMap()
+    incident.origin, incident.normal = wp.vec3(*origin.tolist()), wp.vec3(*normal.tolist())
+    incident.resolution, incident.rays, incident.seed = MAP_TEXELS, MAP_RAYS, frame.seed
+    incident.max_depth = pipeline.indirect.max_depth - 1
+    incident.roulette_depth = max(pipeline.indirect.roulette_depth - 1, 2)
+    incident.sky_probability = sky_probability(scene)
+    incident.sees_sky = int(isinstance(pipeline.environment, TracedEnvironment))
+    incident.light = wp.empty(MAP_TEXELS**2, dtype=wp.float32, device=frame.device)
+    launch.launch(kernels.map_incident_light, MAP_TEXELS**2, [data, incident], frame.device, 16)
+    return incident.light.numpy().reshape(MAP_TEXELS, MAP_TEXELS).astype(np.float64)
+
+
+def quadtree_densities(scheduler: FrameScheduler, leaf: int, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the density [1/sr] of a leaf's quadtree at a position and its cells' nodes, [MAP_PIXELS, MAP_PIXELS]."""
+    guides = scheduler.state("indirect").guides
+    tree, anchor = guides.trees.numpy()[leaf], guides.anchors.numpy()[leaf]
+    densities = wp.empty(MAP_PIXELS**2, dtype=wp.float32, device=scheduler.device)
+    nodes = wp.empty(MAP_PIXELS**2, dtype=wp.int32, device=scheduler.device)
+    settings = [wp.vec4ui(*tree.tolist()), scheduler.pipeline.indirect.bits]
+    settings += [wp.vec4(*anchor.tolist()), wp.vec3(*position.tolist()), MAP_PIXELS]
+    launch.launch(kernels.map_quadtree, MAP_PIXELS**2, [*settings, densities, nodes], scheduler.device)
+    return tuple(values.numpy().reshape(MAP_PIXELS, MAP_PIXELS) for values in (densities, nodes))

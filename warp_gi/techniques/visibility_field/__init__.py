@@ -1,0 +1,1 @@
+"""Discrete visibility fields (dvf.txt)."""

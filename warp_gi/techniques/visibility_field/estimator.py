@@ -1,0 +1,247 @@
+"""Discrete visibility fields: direct light from the sky with most rays never traced (dvf.txt)."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import warp as wp
+
+from warp_gi import launch
+from warp_gi.baking import Bake
+from warp_gi.errors import OptionError, unknown_name
+from warp_gi.estimator import Ahead, Estimator
+from warp_gi.kernels import harmonics as harmonics_kernels
+from warp_gi.kernels import visibility_field as field_kernels
+from warp_gi.kernels import visibility_field_trace as trace_kernels
+from warp_gi.scene.camera import Camera, CameraPath
+from warp_gi.techniques.visibility_field.bake import field_query, grid_of
+from warp_gi.techniques.visibility_field.state import RAYS_A_MILLISECOND, FieldState, cells_on_path, corners_of
+
+_MODES = {
+    "three_state": field_kernels.MODE_THREE_STATE,
+    "unbiased": field_kernels.MODE_UNBIASED,
+    "paper": field_kernels.MODE_PAPER,
+    "traced": field_kernels.MODE_THREE_STATE,
+}
+_SKIES = ("map", "harmonics")
+COSINE_SETS = 32  # turned about the normal at random, so few will do, and few stay in the first cache
+MOST_SET_SIZE = 4096
+MOST_SET_SAMPLES = 1 << 16
+MOST_RESOLUTION = 512
+
+
+@dataclass(frozen=True)
+class VisibilityField(Estimator):
+    """Direct light from the sky, where a baked grid of octahedral masks answers for most rays.
+
+    Biased by what the bake missed, except in the mode "unbiased". The bake depends on the geometry alone: any sky,
+    turning or changing, needs no new one. (Xu et al., "Precomputed Discrete Visibility Fields for Real-Time
+    Ray-Traced Environment Lighting"; the modes beside "paper" are this library's.)
+    """
+
+    term: ClassVar[str] = "environment"
+
+    mode: Literal["three_state", "unbiased", "paper", "traced"] = "three_state"
+    """What a ray does: "three_state" traces what the cell calls mixed or unknown; "unbiased" traces a share of the rest
+    too, and corrects for what that finds; "paper" is the paper's one-sided test with labels, and needs sky "harmonics";
+    "traced" traces all without any bake, to compare with."""
+    sky: Literal["map", "harmonics"] = "map"
+    """"map" samples the sky as it is, by the BSDF and by its radiance; "harmonics" is its low frequencies only, in nine
+    coefficients a channel."""
+    cell_size: float = 0.0
+    """Metres; 0 is a 77th of the scene's longest axis, as in the paper's Sponza."""
+    resolution: int = 84
+    """Texels along a side of a cell's masks; the paper has 18."""
+    samples: int = 0
+    """Surface samples over the whole scene, by area; 0 is 256 for each side of as much surface as a face of a cell."""
+    rays: int = 512
+    """Rays of a surface sample, rounded up to a multiple of 8; the paper has 128."""
+    dilation: int = 1
+    """Texels by which the masks of a cell are dilated."""
+    verify: float = 0.1
+    """Share of the sure rays that the mode "unbiased" traces."""
+    lazy: bool = True
+    """Bake only cells that the camera path sees, and others as they come into view; else all before the first frame."""
+    budget: float = 100.0
+    """Milliseconds a frame for baking cells that come into view, reckoned at 20,000 rays a millisecond on every
+    machine, so that pictures do not depend on its speed. 0 bakes none."""
+    relight: bool = False
+    """Keep what each pixel transfers of every harmonic, and trace nothing while camera and scene stand still and only
+    the sky changes; needs sky "harmonics", and 108 bytes a pixel."""
+
+    def validate(self) -> None:
+        """Raise OptionError for settings out of range."""
+        if self.mode not in _MODES:
+            raise unknown_name("mode of a visibility field", self.mode, _MODES)
+        if self.sky not in _SKIES:
+            raise unknown_name("sky of a visibility field", self.sky, _SKIES)
+        if self.mode == "paper" and self.sky != "harmonics":
+            raise OptionError('mode "paper" subtracts from the irradiance of harmonics; set sky to "harmonics" too')
+        if self.relight and self.sky != "harmonics":
+            raise OptionError('relight needs a low-frequency sky; set sky to "harmonics" too')
+        for name, least, most in (
+            ("resolution", 4, MOST_RESOLUTION),
+            ("samples", 0, 1 << 30),
+            ("rays", 1, MOST_SET_SIZE),
+            ("dilation", 0, 8),
+        ):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
+                raise OptionError(f"{name} must be a whole number from {least} to {most}, got {value!r}")
+        if 2 * self.dilation + 2 > self.resolution:
+            raise OptionError(f"dilation must be below half of the resolution {self.resolution}, got {self.dilation}")
+        if not (math.isfinite(self.cell_size) and self.cell_size >= 0):
+            raise OptionError(f"cell_size must be 0 (automatic) or metres above it, got {self.cell_size}")
+        if not 0 < self.verify <= 1:
+            raise OptionError(f"verify must be a share above 0 and at most 1, got {self.verify}")
+        if not (math.isfinite(self.budget) and self.budget >= 0):
+            raise OptionError(f"budget must be milliseconds of at least 0, got {self.budget}")
+
+    # ---- bake ----
+
+    def bake_key(self, scene: Any) -> str:
+        """Return the hash of the geometry: nothing else decides visibility."""
+        return scene.geometry_hash
+
+    def bake_settings(self, scene: Any) -> dict[str, Any]:
+        """Return the settings that decide the masks, with the cell size in metres."""
+        names = ("resolution", "samples", "rays", "dilation")
+        settings = {name: int(getattr(self, name)) for name in names}
+        return {"cell_size": grid_of(scene.bounds, self.cell_size).cell_size, **settings}
+
+    def bake(
+        self,
+        scene: Any,
+        device: str,
+        seed: int = 0,
+        progress: Callable[[float], None] | None = None,
+        camera: Camera | CameraPath | None = None,
+    ) -> Bake | None:
+        """Return the masks of all cells, or, when ``lazy`` and there is a camera, of those that it sees."""
+        if self.mode == "traced":
+            return None
+        state = FieldState(scene, launch.get_device(device), self, seed)
+        cells = cells_on_path(state, camera) if self.lazy and camera is not None else None
+        state.bake(cells, progress)
+        return state.to_bake()
+
+    def start(self, scene: Any, device: str, bake: Bake | None, seed: int = 0) -> FieldState:
+        """Return the state of a field with the masks of a bake."""
+        target = launch.get_device(device)
+        if bake is None:
+            return FieldState(scene, target, self, seed)
+        return FieldState.from_bake(scene, target, self, seed, bake)
+
+    # ---- frames ----
+
+    @property
+    def saves_state(self) -> bool:
+        """Whether a saved state holds all that frames before left: not transfers, of 108 bytes a pixel."""
+        return not self.relight
+
+    @property
+    def _grows(self) -> bool:
+        return self.mode != "traced" and self.lazy and self.budget > 0
+
+    def depends_on_past(self, scene: Any, ahead: Ahead | None = None) -> bool:
+        """Return whether a frame may find cells that those before it baked, or what pixels transferred then.
+
+        No cells are baked on the way if nothing moves and all cells that the frames ahead see are known.
+        """
+        if self.relight or not self._grows:
+            return self.relight
+        return ahead is None or bool(scene.moving_objects) or ahead.state.lacks(ahead.views)
+
+    def preprocess(self, frame: Any, state: FieldState) -> FieldState:
+        """Bake what came into view, within the budget; draw the frame's samples; look at the sky and at what moves."""
+        state = copy.copy(state)
+        state.query = self._query(frame)
+        state.sky = self._sky(frame)
+        self._bake_in_view(frame, state)
+        if self.relight and not _is_black(frame.scene):
+            key = self._relight_key(frame, state)
+            state.relights = state.transfer_key == key
+            if not state.relights:
+                width, height = frame.camera.resolution
+                state.transfer = wp.zeros(27 * width * height, dtype=wp.float32, device=frame.device)
+                state.transfer_key = key
+        return state
+
+    def _bake_in_view(self, frame: Any, state: FieldState) -> None:
+        if self.mode == "traced":
+            none = wp.empty(0, dtype=wp.int32, device=frame.device), wp.empty(0, dtype=wp.uint32, device=frame.device)
+            state.upload()
+            state.data.slots, state.data.masks = none
+            return
+        state.move(frame.time)
+        most_rays = self.budget * RAYS_A_MILLISECOND
+        if self._grows:
+            cells = state.cells_in_view(frame.camera, corners_of(frame.index))
+            state.bake(cells, None, most_rays)
+            if state.movers and state.rests:
+                state.bake_rest(cells, most_rays)
+        state.upload()
+
+    def _query(self, frame: Any) -> Any:
+        size = min(-(-frame.pipeline.spp // 8) * 8, MOST_SET_SIZE)
+        query = field_query(frame.device, size, COSINE_SETS, frame.seed)
+        query.mode, query.verify = _MODES[self.mode], self.verify
+        return query
+
+    def _sky(self, frame: Any) -> Any:
+        environment, sky = frame.scene.environment, trace_kernels.FieldSky()
+        sky.set_size, sky.set_count = 1, 1
+        if environment is None or environment.is_black:
+            sky.kind = trace_kernels.SKY_CONSTANT
+        elif self.sky == "harmonics":
+            sky.kind = trace_kernels.SKY_HARMONIC
+            sky.harmonics = harmonics_kernels.Harmonics(*environment.harmonics.reshape(-1))
+        elif environment.pixels is None:
+            sky.kind = trace_kernels.SKY_CONSTANT
+            sky.radiance = wp.vec3(*environment.mean_radiance)
+        else:
+            sky.kind = trace_kernels.SKY_MAP
+            sky.set_size = min(-(-frame.pipeline.spp // 8) * 8, MOST_SET_SIZE)
+            sky.set_count = _set_count(sky.set_size)
+            count = sky.set_size * sky.set_count
+            sky.directions = wp.empty(count, dtype=wp.vec3, device=frame.device)
+            sky.radiances = wp.empty(count, dtype=wp.vec3, device=frame.device)
+            sky.pdfs = wp.empty(count, dtype=wp.float32, device=frame.device)
+            frame.launch(trace_kernels.sample_sky, [frame.data, frame.seed, sky], count)
+        return sky
+
+    def trace(self, frame: Any, state: FieldState) -> None:
+        """Add the light of the current camera sample, or of all of them when the pixels' transfers are known."""
+        if _is_black(frame.scene):
+            return
+        if self.relight and state.relights:
+            if frame.pass_settings.camera_sample == 0:
+                frame.launch(trace_kernels.relight, [state.sky.harmonics, state.transfer, frame["environment"]])
+            return
+        transfer = state.transfer if self.relight else wp.empty(0, dtype=wp.float32, device=frame.device)
+        buffers = trace_kernels.FieldBuffers()
+        buffers.environment, buffers.transfer = frame["environment"], transfer
+        buffers.moment1, buffers.moment2 = frame.moments("environment")
+        field = trace_kernels.Field()
+        field.grid, field.query, field.sky = state.data, state.query, state.sky
+        inputs = [frame.data, frame.camera_data, frame.pass_settings, field, frame.hits, buffers]
+        frame.launch_tiled(trace_kernels.trace_field, inputs)
+
+    def _relight_key(self, frame: Any, state: FieldState) -> tuple[Any, ...]:
+        poses = b"".join(pose.tobytes() for pose in state.poses or ())
+        camera = frame.camera
+        return camera.world_from_camera.tobytes(), camera.hfov, camera.resolution, poses, len(state.cells)
+
+
+def _is_black(scene: Any) -> bool:
+    return scene.environment is None or scene.environment.is_black
+
+
+def _set_count(size: int) -> int:
+    """Return how many sets of samples a frame draws, a power of two."""
+    return 1 << max(min(MOST_SET_SAMPLES // size, 256), 16).bit_length() - 1
