@@ -16,8 +16,10 @@ from types import ModuleType
 import warp as wp
 
 import warp_gi.kernels
-from warp_gi import launch
-from warp_gi.kernels.path_tracers import every_tracer
+from warp_gi import launch, registry
+from warp_gi.kernels.path_samplers import NO_REGIONS, DirectionSampler, LightSampler
+from warp_gi.kernels.path_trace import PathTracer, path_tracer
+from warp_gi.kernels.samples import SAMPLE_REGIONS
 
 ARCHITECTURES = (80, 90)
 
@@ -27,6 +29,18 @@ def kernel_modules() -> list[str]:
     names = [info.name for info in pkgutil.iter_modules(warp_gi.kernels.__path__, "warp_gi.kernels.")]
     names = [name for name in names if _has_kernels(importlib.import_module(name))]
     return sorted([*names, *(tracer.trace_paths.module.name for tracer in every_tracer())])
+
+
+def every_tracer() -> list[PathTracer]:
+    """Return the path tracer of each light sampler with each direction sampler of the registry."""
+    found = registry.samplers().values()
+    lights = [one for one in found if isinstance(one, LightSampler)]
+    directions = [one for one in found if isinstance(one, DirectionSampler)]
+    return [
+        path_tracer(light, direction, SAMPLE_REGIONS if light.uses_regions or direction.uses_regions else NO_REGIONS)
+        for light in lights
+        for direction in directions
+    ]
 
 
 def compile_module(name: str, architectures: Sequence[int], folder: Path) -> list[Path]:

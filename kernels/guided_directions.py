@@ -103,4 +103,6 @@ def guided_direction_pdf(
     return share * bsdf_pdf + (1.0 - share) * tree_pdf(data, region, s, wi)
 
 
-GUIDED_DIRECTIONS = DirectionSampler("guided", GuidedDirections, guided_direction, guided_direction_pdf)
+GUIDED_DIRECTIONS = DirectionSampler(
+    "guided", GuidedDirections, guided_direction, guided_direction_pdf, uses_regions=True
+)

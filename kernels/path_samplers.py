@@ -27,6 +27,7 @@ class LightSampler(NamedTuple):
     choose: wp.Function  # (data, scene, region, surface, wo, u: vec2) -> LightChoice
     pdf: wp.Function  # (data, scene, region, surface, wo, emitter) -> LightChoice.pdf of that emitter
     explore: wp.Function | None = None  # (the same as `choose`, but u: vec3) -> another LightChoice, or none
+    uses_regions: bool = False  # whether it tells regions apart and learns from the samples kept in them
 
 
 class DirectionSampler(NamedTuple):
@@ -36,6 +37,7 @@ class DirectionSampler(NamedTuple):
     data: Any  # struct
     sample: wp.Function  # (data, region, surface, wo, index, seed, dimension) -> DirectionSample
     pdf: wp.Function  # (data, region, surface, wi in the world, pdf of the BSDF) -> pdf of `sample`
+    uses_regions: bool = False  # as of a LightSampler
 
 
 class Regions(NamedTuple):

@@ -18,6 +18,7 @@ from warp_gi.bench.harness.presets import quad
 from warp_gi.kernels import bsdf, light_cache, light_cache_build, light_hierarchy, ltc, samples, surface, types
 from warp_gi.kernels.emitters import LightChoice, punctual_light
 from warp_gi.launch import copied, launch
+from warp_gi.paths import PathRequest
 
 wp.set_module_options({"enable_backward": False})
 
@@ -223,9 +224,13 @@ def preprocessed(scene, estimator=None, state=None, time=0.0, position=(0.0, 1.0
         device=device(),
         data=data,
         camera=SimpleNamespace(position=position),
+        paths=PathRequest(),
         launch=lambda kernel, inputs, count: launch(kernel, count, inputs, device()),
     )
-    return frame, estimator.preprocess(frame, state)
+    state = estimator.preprocess(frame, state)
+    if frame.paths.table is not None:
+        data.emitters.alias = frame.paths.table  # as the path tracer's launch does
+    return frame, state
 
 
 def table(contents, rates=None, alone=None):
@@ -280,7 +285,7 @@ PLACES.append((ROOF, "above"))  # whence the sun is all there is
 def lit_cache(explores_by="hierarchy"):
     """A frame, the LightCache of CONTENTS, and PLACES in each of its regions."""
     frame, _ = preprocessed(lit_scene(), gi.VisibilityLightCache(explores_by=explores_by))
-    data = frame.lights.data
+    data = frame.paths.lights.data
     data.tables = table(CONTENTS.values(), alone=[name == "explores alone" for name in CONTENTS])
     return frame, data, spots_in(np.arange(len(CONTENTS)))
 
@@ -474,10 +479,10 @@ def learnt_cache(explores_by):
     leaves = np.concatenate([np.argsort(-buckets)[:6], [np.flatnonzero(buckets == n)[0] for n in (0, 1, 2)]])
     alone = np.zeros(len(buckets), np.int32)
     alone[leaves[[1, 8]]] = 1
-    tables = frame.lights.data.tables
+    tables = frame.paths.lights.data.tables
     tables.alone = array(alone)
-    frame.lights.data.tables = tables
-    return frame, frame.lights.data, spots_in(leaves)
+    frame.paths.lights.data.tables = tables
+    return frame, frame.paths.lights.data, spots_in(leaves)
 
 
 def random_cache(explores_by):
@@ -490,6 +495,6 @@ def random_cache(explores_by):
         main, others = np.split(lights[: rng.integers(40, 203)], [rng.integers(1, 33)])
         full = [others[others % count == k][:32] for k in range(count)]
         contents.append((main, np.concatenate([*full, []]).astype(int), count, rng.choice([0.02, 0.1, 0.5, 0.75])))
-    data = frame.lights.data
+    data = frame.paths.lights.data
     data.tables = table(contents, alone=np.arange(len(contents)) == 3)
     return frame, data, spots_in(np.arange(len(contents)))

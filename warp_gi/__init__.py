@@ -36,24 +36,13 @@ _PUBLIC = {
     "CameraKey": "warp_gi.scene.camera",
     "Pipeline": "warp_gi.pipeline",
     "Estimator": "warp_gi.estimator",
-    "TracedEnvironment": "warp_gi.techniques.paths.estimators",
-    "UniformLights": "warp_gi.techniques.paths.estimators",
-    "PowerLights": "warp_gi.techniques.paths.estimators",
-    "BsdfPaths": "warp_gi.techniques.paths.estimators",
-    "LightHierarchy": "warp_gi.techniques.light_hierarchy.estimator",
-    "VisibilityLightCache": "warp_gi.techniques.reuse.light_cache",
-    "GuidedPaths": "warp_gi.techniques.reuse.guided_paths",
-    "SampleOctree": "warp_gi.techniques.reuse.sample_octree",
-    "reuse_pictures": "warp_gi.techniques.reuse.pictures",
-    "VisibilityField": "warp_gi.techniques.visibility_field.estimator",
-    "LightFieldProbes": "warp_gi.techniques.light_field.estimator",
     "Denoiser": "warp_gi.denoise",
     "SpatioTemporal": "warp_gi.denoise",
     "Oidn": "warp_gi.denoise",
-    "bake": "warp_gi.scheduler",
+    "bake": "warp_gi.rendering",
     "FrameScheduler": "warp_gi.scheduler",
-    "Frame": "warp_gi.scheduler",
-    "render": "warp_gi.scheduler",
+    "Frame": "warp_gi.frame",
+    "render": "warp_gi.rendering",
     "write_frame": "warp_gi.sequence.frames",
     "read_frame": "warp_gi.sequence.frames",
     "builtin_camera_path": "warp_gi.scene.builtin",
@@ -61,8 +50,7 @@ _PUBLIC = {
     "set_threads": "warp_gi.launch",
 }
 _MODULES = ("metrics",)
-
-__all__ = sorted([*_PUBLIC, *_MODULES])
+# classes and functions of techniques: the registry names them
 
 
 def __getattr__(name: str) -> Any:
@@ -70,8 +58,13 @@ def __getattr__(name: str) -> Any:
         return getattr(importlib.import_module(_PUBLIC[name]), name)
     if name in _MODULES:
         return importlib.import_module(f"warp_gi.{name}")
+    registry = importlib.import_module("warp_gi.registry")
+    if name == "__all__":
+        return sorted([*_PUBLIC, *_MODULES, *registry.public()])
+    if not name.startswith("_") and name in registry.public():
+        return registry.find(name)
     raise AttributeError(f"module 'warp_gi' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted([*globals(), *__getattr__("__all__")])

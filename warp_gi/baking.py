@@ -103,6 +103,10 @@ class Bake:
         """Read a bake; see ``load_bake``."""
         return load_bake(path)
 
+    def has(self, settings: Mapping[str, Any]) -> bool:
+        """Return whether the bake was made with these settings."""
+        return self.settings == dict(settings)
+
     def check(self, technique: str, scene_key: str, settings: Mapping[str, Any], scene_name: str = "") -> None:
         """Raise BakeError saying why, unless the bake is by ``technique``, of this scene and with these settings."""
         if technique != self.technique:

@@ -13,9 +13,13 @@ import warp as wp
 
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.kernels import denoise
+from warp_gi.stateful import Ahead, Stateful
 
 if TYPE_CHECKING:
-    from warp_gi.scheduler import Frame
+    from warp_gi.baking import Bake
+    from warp_gi.frame import Frame
+    from warp_gi.scene.baked import BakedScene
+    from warp_gi.scene.scene import Scene
 
 __all__ = ["DENOISERS", "Denoiser", "Oidn", "SpatioTemporal"]
 
@@ -24,29 +28,23 @@ QUALITIES = ("high", "balanced", "fast")
 
 
 @dataclass(frozen=True)
-class Denoiser:
+class Denoiser(Stateful):
     """Base of every denoiser; a frozen dataclass of plain settings.
 
-    ``start`` makes the state before the first frame, ``apply`` fills a frame's ``beauty`` and returns the
-    state for the next frame, leaving the last one as it is. A denoiser keeps nothing anywhere but in its state.
+    ``start`` makes the state before the first frame. ``apply`` fills a frame's ``beauty`` and returns the state for
+    the next frame, leaving the last one as it is. A denoiser keeps nothing anywhere but in its state.
     """
 
     wants_lobes: ClassVar[bool] = False
     """Whether ``apply`` reads the guides and the separated light (``Frame.lobes``)."""
 
-    def __post_init__(self) -> None:
-        self.validate()
-
-    def validate(self) -> None:
-        """Raise OptionError for settings out of range."""
-
-    def depends_on_past(self) -> bool:
+    def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
         """Return whether a frame depends on those before it; True, unless a denoiser promises that it does not."""
         return True
 
-    def start(self, device: wp.Device) -> Any:
-        """Return the state before the first frame; raises OptionError if something is not installed."""
-        return None
+    def bake_key(self, scene: Scene | BakedScene) -> str:
+        """Return the same for every scene: a denoiser learns of a change from the frames."""
+        return "any scene"
 
     def apply(self, frame: Frame, state: Any) -> Any:
         """Fill ``frame["beauty"]`` from ``frame["noisy"]`` and the other buffers, and return the new state."""
@@ -179,7 +177,7 @@ class SpatioTemporal(Denoiser):
         settings.stride = getattr(self, f"{kind}_stride")
         settings.deviation = settings.radius / 2
         settings.plane_distance, settings.normal_power = self.plane_distance, self.normal_power
-        settings.samples = frame.pipeline.spp
+        settings.samples = frame.settings.spp
         settings.longest = (1.0 + hysteresis) / (1.0 - hysteresis)
         settings.shrink = self.shrink
         return settings
@@ -210,11 +208,11 @@ class Oidn(Denoiser):
         if self.quality not in QUALITIES:
             raise unknown_name("quality", self.quality, QUALITIES)
 
-    def depends_on_past(self) -> bool:
+    def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
         """Return False: the state is the library."""
         return False
 
-    def start(self, device: wp.Device) -> Any:
+    def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> Any:
         """Return the library; raises OptionError where it is not installed."""
         try:
             return importlib.import_module("pyoidn")

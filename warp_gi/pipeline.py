@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, fields, replace
 from numbers import Integral
 from typing import Any
 
-from warp_gi.denoise import Denoiser, Oidn, SpatioTemporal, denoiser_named
+from warp_gi import registry
+from warp_gi.baking import Bake
+from warp_gi.denoise import Denoiser, denoiser_named
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.estimator import Estimator
-from warp_gi.techniques.light_field.estimator import LightFieldProbes
-from warp_gi.techniques.light_hierarchy.estimator import LightHierarchy
-from warp_gi.techniques.paths.estimators import BsdfPaths, PowerLights, TracedEnvironment, UniformLights
-from warp_gi.techniques.reuse.guided_paths import GuidedPaths
-from warp_gi.techniques.reuse.light_cache import VisibilityLightCache
-from warp_gi.techniques.reuse.sample_octree import SampleOctree
-from warp_gi.techniques.visibility_field.estimator import VisibilityField
+from warp_gi.frame import TERMS, FrameSettings
+from warp_gi.primary import CameraRays, Primary
+from warp_gi.radiance_cache import RadianceCache
+from warp_gi.scene.baked import BakedScene
+from warp_gi.scene.scene import Scene
+from warp_gi.sequence.state import Dependence
+from warp_gi.service import Service
+from warp_gi.stateful import Ahead, Stateful
 
-__all__ = ["PRESETS", "TERMS", "Estimator", "Pipeline"]
-
-TERMS = ("environment", "emitters", "indirect")
 FILTERS = ("box", "tent")
 MOST_SAMPLES = 1 << 24  # a pixel; random numbers count samples and pixels together in 32 bits
+DENOISER = "denoise"
+"""Place of the denoiser among states."""
+
+
+def _made(name: str) -> Any:
+    """Return a dataclass field whose default is a class of the registry with its own defaults."""
+    return field(default_factory=lambda: registry.find(name)())
 
 
 @dataclass(frozen=True)
@@ -32,11 +39,11 @@ class Pipeline:
     Raises OptionError for settings that make no sense.
     """
 
-    environment: TracedEnvironment | VisibilityField | None = TracedEnvironment()
+    environment: Estimator | None = _made("TracedEnvironment")
     """Direct light from the sky."""
-    emitters: PowerLights | UniformLights | LightHierarchy | VisibilityLightCache | None = PowerLights()
+    emitters: Estimator | None = _made("PowerLights")
     """Direct light from emissive triangles and punctual lights."""
-    indirect: BsdfPaths | GuidedPaths | LightFieldProbes | None = BsdfPaths()
+    indirect: Estimator | None = _made("BsdfPaths")
     """Light that arrives over other surfaces."""
     spp: int = 16
     """Samples a pixel."""
@@ -45,11 +52,11 @@ class Pipeline:
     less. 1 gives pixel centres, spp one a sample as a reference wants."""
     filter: str = "box"
     """Pixel filter: "box" or "tent" (two pixels wide)."""
-    denoise: SpatioTemporal | Oidn | None = None
+    denoise: Denoiser | None = None
     """What makes the beauty of the noisy terms, or its name: "spatiotemporal", "oidn". The terms stay noisy."""
 
-    octree: SampleOctree = SampleOctree()
-    """Where the techniques that learn from samples learn: VisibilityLightCache and GuidedPaths share it."""
+    octree: Service = _made("SampleOctree")
+    """Octree of regions shared by the techniques that learn (``VisibilityLightCache``, ``GuidedPaths``)."""
 
     def __post_init__(self) -> None:
         for name in ("spp", "camera_samples"):
@@ -68,22 +75,23 @@ class Pipeline:
             object.__setattr__(self, "denoise", denoiser_named(self.denoise))
         if not isinstance(self.denoise, Denoiser | None):
             raise OptionError(f"denoise must be a Denoiser, the name of one, or None, got {self.denoise!r:.80}")
-        if not isinstance(self.octree, SampleOctree):
+        if not isinstance(self.octree, Service) or self.octree.name != "octree":
             raise OptionError(f"octree must be a SampleOctree, got {self.octree!r:.80}")
-        for term, estimator in zip(TERMS, (self.environment, self.emitters, self.indirect), strict=True):
+        for term in TERMS:
+            estimator = getattr(self, term)
             if estimator is not None and getattr(estimator, "term", None) != term:
                 raise OptionError(f"{term} must be an estimator of that term or None, got {estimator!r}")
-        alone = [estimator for _, estimator in self.estimators() if estimator.makes_primary]
-        if alone and (len(list(self.estimators())) > 1 or self.denoise is not None):
+        self._check_alone()
+
+    def _check_alone(self) -> None:
+        whole = [estimator for _, estimator in self.estimators() if _is_whole(estimator)]
+        if whole and (len(list(self.estimators())) > 1 or self.denoise is not None):
             raise OptionError(
-                f"{type(alone[0]).__name__} finds primary hits itself, and holds all light that they send; leave the "
+                f"{type(whole[0]).__name__} finds primary hits itself, and holds all light that they send; leave the "
                 'other terms and the denoiser out, as the preset "probe_view" does'
             )
 
-    @property
-    def camera_sample_count(self) -> int:
-        """Camera rays a pixel."""
-        return min(4, self.spp) if self.camera_samples is None else self.camera_samples
+    # ---- parts ----
 
     def estimators(self) -> Iterator[tuple[str, Estimator]]:
         """Yield (term, estimator) of the terms that are not left out."""
@@ -92,20 +100,98 @@ class Pipeline:
             if estimator is not None:
                 yield term, estimator
 
+    def services(self) -> dict[str, Service]:
+        """Return the services that estimators ask for, by name.
+
+        Raises OptionError where two estimators ask for one with different settings, and no field here has its name.
+        """
+        found: dict[str, Service] = {}
+        for term, estimator in self.estimators():
+            for service in estimator.services:
+                service = getattr(self, service.name, service)
+                if found.setdefault(service.name, service) != service:
+                    raise OptionError(
+                        f"{term} asks for the service {service.name!r} with other settings than others do"
+                    )
+        return found
+
+    def radiance_caches(self) -> Iterator[tuple[str, RadianceCache]]:
+        """Yield (place, cache) of the radiance caches in which paths end, for example ("indirect.ends_in", ...)."""
+        for term, estimator in self.estimators():
+            if estimator.radiance_cache is not None:
+                yield f"{term}.ends_in", estimator.radiance_cache
+
+    def primary(self) -> tuple[str, Primary]:
+        """Return what finds the frame's primary hits, and whose state it reads: a term, or "" for none."""
+        for term, estimator in self.estimators():
+            if estimator.own_primary is not None:
+                return term, estimator.own_primary
+        return "", CameraRays()
+
+    def parts(self) -> dict[str, Stateful]:
+        """Return all that keeps a state over frames, by its place, in the order in which frames ask them."""
+        parts: dict[str, Stateful] = {**self.services(), **dict(self.radiance_caches()), **dict(self.estimators())}
+        return parts if self.denoise is None else parts | {DENOISER: self.denoise}
+
+    def dependence(self, scene: Scene | BakedScene, ahead: Callable[[str], Ahead] | None = None) -> Dependence:
+        """Return how frames of a scene depend on those before: not, on a state that can be saved, or on others.
+
+        ``ahead`` returns what is known of the frames to come for the part in a place; None asks for every camera, sky
+        and state that there may be.
+        """
+        depends = {
+            place: part
+            for place, part in self.parts().items()
+            if part.depends_on_past(scene, None if ahead is None else ahead(place))
+        }
+        for term, estimator in self.estimators():
+            for service in estimator.services if term in depends else ():
+                depends.pop(service.name, None)  # its state is of use to the estimator alone, which is named
+        if DENOISER in depends:
+            depends["denoiser"] = depends.pop(DENOISER)
+        unsaved = [place for place, part in depends.items() if not part.saves_state]
+        return Dependence(tuple(depends), tuple(unsaved))
+
+    def fitting(self, bake: Bake) -> Pipeline:
+        """Return the pipeline with its settings as those of a bake that is rendered without its scene.
+
+        Raises OptionError for a pipeline that cannot show a bake alone, BakeError for another technique's bake.
+        """
+        term, primary = self.primary()
+        if not primary.is_whole:
+            raise OptionError(
+                'a bake without its scene is rendered by the preset "probe_view"; give the scene for other pipelines'
+            )
+        return replace(self, **{term: getattr(self, term).fitting(bake)})
+
+    # ---- settings ----
+
+    @property
+    def camera_sample_count(self) -> int:
+        """Camera rays a pixel."""
+        return min(4, self.spp) if self.camera_samples is None else self.camera_samples
+
+    @property
+    def frame_settings(self) -> FrameSettings:
+        """Settings that decide how a frame is sampled."""
+        wants_lobes = self.denoise is not None and self.denoise.wants_lobes
+        return FrameSettings(self.spp, self.camera_sample_count, self.filter, wants_lobes)
+
     def describe(self) -> dict[str, Any]:
         """Return all settings by dotted name, e.g. {"indirect": "BsdfPaths", "indirect.max_depth": 64, ...}."""
         settings: dict[str, Any] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name == "octree" and not any(estimator.learns for _, estimator in self.estimators()):
-                continue
-            if isinstance(value, Estimator | Denoiser | SampleOctree):
-                settings[field.name] = type(value).__name__
-                settings.update({f"{field.name}.{name}": setting for name, setting in asdict(value).items()})
-            else:
-                settings[field.name] = value
+        services = self.services()
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if not isinstance(value, Service) or value.name in services:
+                settings |= _described(one.name, value)
         settings["camera_samples"] = self.camera_sample_count
         return settings
+
+    @classmethod
+    def presets(cls) -> tuple[str, ...]:
+        """Return the names of all presets."""
+        return tuple(registry.presets())
 
     @classmethod
     def preset(cls, name: str, **settings: Any) -> Pipeline:
@@ -113,22 +199,52 @@ class Pipeline:
 
         Raises OptionError for an unknown name or setting.
         """
-        if name not in PRESETS:
-            raise unknown_name("pipeline", name, PRESETS)
-        known = {field.name for field in fields(cls)}
+        known = registry.presets()
+        if name not in known:
+            raise unknown_name("pipeline", name, known)
+        names = {one.name for one in fields(cls)}
         for setting in settings:
-            if setting not in known:
-                raise unknown_name("pipeline setting", setting, known)
-        return cls(**{**PRESETS[name], **settings})
+            if setting not in names:
+                raise unknown_name("pipeline setting", setting, names)
+        made = {key: _estimator_of(value) for key, value in known[name].items() if key not in settings}
+        return cls(**made, **settings)
 
 
-PRESETS: dict[str, dict[str, Any]] = {
-    "path": {},
-    "direct": {"indirect": None},
-    "dvf": {"environment": VisibilityField()},
-    "reuse": {"emitters": VisibilityLightCache(), "indirect": GuidedPaths()},
-    "hybrid": {"environment": VisibilityField(), "emitters": VisibilityLightCache(), "indirect": GuidedPaths()},
-    "probes": {"indirect": LightFieldProbes()},
-    "probe_view": {"environment": None, "emitters": None, "indirect": LightFieldProbes(primary="probes")},
-}
-"""Fields of each named pipeline, where they differ from the defaults."""
+def estimator_named(term: str, name: str) -> Estimator:
+    """Return the estimator of a class name with its defaults.
+
+    Raises OptionError if there is none, with the names of those of the term.
+    """
+    classes = {known: registry.find(known) for one in registry.techniques().values() for known in one.estimators}
+    if name not in classes:
+        of_term = [known for known, kind in classes.items() if kind.term == term]
+        raise unknown_name(f"{term} estimator", name, of_term)
+    return classes[name]()
+
+
+def _estimator_of(value: Any) -> Any:
+    """Return what a preset's value stands for: a class name, a pair of that and its settings, or the value itself."""
+    if isinstance(value, str):
+        return registry.find(value)()
+    if isinstance(value, tuple):
+        name, settings = value
+        return registry.find(name)(**settings)
+    return value
+
+
+def _is_whole(estimator: Estimator) -> bool:
+    return estimator.own_primary is not None and estimator.own_primary.is_whole
+
+
+def _described(name: str, value: Any) -> dict[str, Any]:
+    """Return a setting, and those within it, by dotted name."""
+    if not isinstance(value, Stateful):
+        return {name: value}
+    settings: dict[str, Any] = {name: type(value).__name__}
+    for one in fields(value):
+        inner = getattr(value, one.name)
+        if isinstance(inner, Stateful):
+            settings |= _described(f"{name}.{one.name}", inner)
+        elif not (inner is None and one.name == "ends_in"):
+            settings[f"{name}.{one.name}"] = inner
+    return settings

@@ -13,7 +13,7 @@ import warp_gi as gi
 from warp_gi.bench.harness import presets
 from warp_gi.bench.harness.measure import Taken, Times, take_turns, timed
 from warp_gi.bench.harness.places import PLACES
-from warp_gi.pipeline import TERMS
+from warp_gi.frame import TERMS
 
 LAMBERT: Mapping[str, bool] = {"diffuse": True}
 DARK: Mapping[str, bool] = {"diffuse": True, "emission": False}
@@ -81,8 +81,8 @@ class Stage:
     def trace(self) -> None:
         """Do the stage once more; its sums are no picture any more."""
         self.estimator.trace(self.frame, self.state)
-        if self.frame.wants_paths:
-            self.frame.launch_paths()
+        if self.frame.paths.is_wanted:
+            self.frame.paths.launch(self.frame)
         wp.synchronize_device(self.frame.device)
 
 

@@ -260,7 +260,7 @@ def expected_importances(data, places):
 def dimmed_cache():
     """LightCache of lit_scene, in which every tenth light emits nothing."""
     frame, _ = preprocessed(lit_scene())
-    data = frame.lights.data
+    data = frame.paths.lights.data
     shapes = data.shapes.numpy().copy()
     shapes["luminance"][::10] = 0.0
     data.shapes = wp.array(shapes, dtype=light_cache_native.LightShape, device=device())
@@ -744,7 +744,7 @@ def test_a_region_knows_what_it_and_its_neighbours_saw():
         ]
         check_weights(found, learnt)
         tries = found[0]
-        importances, rates = importances_of(frame.lights.data, cells_of(lesson)), rates_of(state.tables)
+        importances, rates = importances_of(frame.paths.lights.data, cells_of(lesson)), rates_of(state.tables)
         buckets = []
         for leaf, (lights, entries) in enumerate(zip(contents_of(state.tables), expected, strict=True)):
             last = before[origins[leaf]] if origins[leaf] >= 0 else 0

@@ -135,9 +135,11 @@ def test_the_hierarchy_follows_lights_that_move():
     spots.faces, spots.regions, spots.views = array([0]), array([0]), array([(0.0, 1.0, 0.0)], wp.vec3)
 
     def chances(frame):
-        assert frame.lights.data.explores_by_tree == 1
-        found = asked(ask_hierarchy, frame.lights.data.tree, frame, spots)
-        assert np.allclose(found, probabilities(frame, frame.lights.data, spots)[0], rtol=1e-5)  # nothing is cached
+        assert frame.paths.lights.data.explores_by_tree == 1
+        found = asked(ask_hierarchy, frame.paths.lights.data.tree, frame, spots)
+        assert np.allclose(
+            found, probabilities(frame, frame.paths.lights.data, spots)[0], rtol=1e-5
+        )  # nothing is cached
         return found
 
     frame, state = preprocessed(scene, estimator)

@@ -531,7 +531,7 @@ def test_origin_of_a_collapsed_cell_is_the_fullest():
 
 def opened(resolution, spp, vertices, most, seed=5, previous=None):
     items = math.prod(8 * math.ceil(size / 8) for size in resolution)
-    frame = SimpleNamespace(tiled_items=items, pipeline=SimpleNamespace(spp=spp), device=device(), seed=seed)
+    frame = SimpleNamespace(tiled_items=items, settings=SimpleNamespace(spp=spp), device=device(), seed=seed)
     return gi.SampleOctree(most_samples=most).records(frame, vertices, previous)
 
 

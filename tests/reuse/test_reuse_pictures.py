@@ -147,7 +147,7 @@ def test_leaves_have_colours_of_their_own(scheduler, frame, tmp_path, scales):
     (title,) = [told[1] for told in scales if len(told) == 2 and "leaves" in str(told[1])]
     masks = scheduler.state("octree").octree.nodes.numpy() & 255
     count = sum(int(mask).bit_count() for mask in masks)
-    total = int((scheduler._records.codes.numpy() != 0xFFFFFFFF).sum())
+    total = int((scheduler.state("octree").spare.records.codes.numpy() != 0xFFFFFFFF).sum())
     seen = len(np.unique(leaves[leaves >= 0]))
     assert title == f"{count:,} leaves, {seen} of them in view, {total:,} samples of frame 3"
 
@@ -160,7 +160,7 @@ def test_heat_is_what_leaves_hold(scheduler, frame, tmp_path, scales):
     assert sorted(tmp_path.iterdir()) == sorted(paths)
     leaves = leaves_of(scheduler, frame)
     counts = np.zeros(8 * len(scheduler.state("octree").octree.nodes), int)
-    low, codes = scheduler.state("octree"), scheduler._records.codes.numpy()
+    low, codes = scheduler.state("octree"), scheduler.state("octree").spare.records.codes.numpy()
     for code in codes[codes != 0xFFFFFFFF]:
         at = [sum((int(code) >> (3 * bit + axis) & 1) << bit for bit in range(10)) for axis in range(3)]
         counts[leaf_of(low.octree, np.array(low.octree.low) + (np.array(at) + 0.5) / low.octree.scale)] += 1

@@ -11,7 +11,7 @@ import warp_gi as gi
 from warp_gi.bench.harness.presets import sphere
 from warp_gi.errors import BakeError, OptionError
 from warp_gi.launch import set_threads
-from warp_gi.scheduler import MOST_VERTICES
+from warp_gi.techniques.reuse.sample_octree import MOST_VERTICES
 
 SIZE = (24, 16)
 SPP = 8
@@ -193,7 +193,7 @@ def test_paths_may_be_longer_than_what_is_kept_of_them():
     closed = hall(sky=False)
     chosen = pipeline(indirect=gi.GuidedPaths(max_depth=40, roulette_depth=40), spp=1)
     scheduler, frames = sequence([0], closed, chosen)
-    records = scheduler._records
+    records = scheduler.state("octree").spare.records
     assert records.vertices == MOST_VERTICES == 7 and records.codes.shape[0] % 7 == 0
     used = (records.codes.numpy().reshape(-1, 7) != 0xFFFFFFFF).sum(axis=1)
     assert used.max() == 7
@@ -224,7 +224,7 @@ class Kept:
         indirect = gi.GuidedPaths(max_depth=4, roulette_depth=roulette_depth)
         scheduler = gi.FrameScheduler(court(albedo), camera, pipeline(indirect=indirect), st.device().alias, seed=5)
         scheduler.frame(0)
-        records, cube = scheduler._records, scheduler.state("octree").octree
+        records, cube = scheduler.state("octree").spare.records, scheduler.state("octree").octree
         assert records.vertices == 3 and records.stride == 1
 
         def column(name):
@@ -304,7 +304,7 @@ def leaf_of(nodes, code):
 def test_spheres_stand_where_light_comes_from():
     """After a frame the sphere of a region is as large as the light's distances say, or as the cell demands."""
     scheduler, _ = sequence([0], court(0.5), pipeline(indirect=gi.GuidedPaths(max_depth=5, samples=1 << 20)))
-    records, state = scheduler._records, scheduler.state("octree")
+    records, state = scheduler.state("octree").spare.records, scheduler.state("octree")
     contributions, nearness = (
         getattr(records, name).numpy().astype(np.float64) for name in ("contributions", "nearness")
     )
@@ -350,12 +350,12 @@ def test_a_changed_resolution_and_a_cut_camera():
     scheduler = gi.FrameScheduler(scene, gi.CameraPath.still(view()), pipeline(), st.device().alias, 3)
     for index in range(3):
         scheduler.frame(index)
-    slots = scheduler._records.codes.shape[0]
+    slots = scheduler.state("octree").spare.records.codes.shape[0]
     known = scheduler.state("emitters").known.counts.numpy().sum()
     other = gi.Camera.look_at((1.7, 1.5, 1.8), (0.9, 0.3, -1.5), hfov=70, resolution=(40, 24))
     scheduler.camera = gi.CameraPath.still(other)
     cut = [scheduler.frame(index).numpy("emitters").mean() for index in range(3, 35)]
-    assert scheduler._records.codes.shape[0] > slots
+    assert scheduler.state("octree").spare.records.codes.shape[0] > slots
     assert scheduler.state("emitters").known.counts.numpy().sum() > 0 < known
     plain = gi.FrameScheduler(scene, gi.CameraPath.still(other), pipeline(**PLAIN, spp=64), st.device().alias, 4)
     truth = [plain.frame(index).numpy("emitters").mean() for index in range(32)]
@@ -378,7 +378,7 @@ def test_another_sky_keeps_what_was_learnt():
 def test_records_stay_within_their_bound():
     chosen = pipeline(octree=gi.SampleOctree(split=192, collapse=96, most_samples=1024))
     scheduler, _ = sequence(range(2), chosen=chosen)
-    assert 0 < scheduler._records.codes.shape[0] <= 1024 + 4
+    assert 0 < scheduler.state("octree").spare.records.codes.shape[0] <= 1024 + 4
     assert scheduler.state("octree").counts.numpy()[:8].sum() > 100
 
 

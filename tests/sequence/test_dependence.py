@@ -183,9 +183,7 @@ def wholes(tmp_path_factory):
 
 
 def test_every_preset_is_here():
-    from warp_gi.pipeline import PRESETS
-
-    assert set(PRESETS) <= set(CASES)
+    assert set(gi.Pipeline.presets()) <= set(CASES)
 
 
 def test_an_estimator_that_preprocesses_or_learns_depends_on_the_past_unless_it_says_not():
@@ -263,7 +261,7 @@ def other_scheduler(run):
     """Return a new scheduler of a scene that has been rendered already, which stands as the last frame left it."""
     old = run.scheduler
     scene = old.scene.bake if run.case.alone else old.scene
-    bakes = [] if run.case.alone else old._bakes.values()
+    bakes = [] if run.case.alone else [bake for given in old._bakes.values() for bake in given]
     return gi.FrameScheduler(scene, old.camera, old.pipeline, st.device().alias, 3, bakes=bakes)
 
 
@@ -351,7 +349,8 @@ def test_an_interrupted_frame_leaves_nothing_behind(name, wholes, monkeypatch):
     for index, at in ((1, -1), (3, -3)):
         run = interrupts(CASES[name], index, at, monkeypatch)
         assert run is not None
-        assert run.scheduler._records is None  # slices of a launch that was stopped may still write there
+        if name == "reuse moving":  # slices of a launch that was stopped may still write to its samples
+            assert run.scheduler.state("octree").spare.records is None
         for number in (index, index + 1):
             assert_same(run.frame(number), frames[number], f"frame {number}, stopped in {index} at {at}")
             assert_same(run.state(), states[number][1], f"state {number}, stopped in {index} at {at}")

@@ -19,9 +19,9 @@ from warp_gi.cli.report import Reporter, start_warp
 from warp_gi.cli.techniques import DEFAULT_TECHNIQUE, TECHNIQUES, Settings, technique_of
 from warp_gi.errors import OptionError
 from warp_gi.files import check_writable, remove_stale_parts
+from warp_gi.rendering import bake
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.scene import Scene
-from warp_gi.scheduler import bake
 
 DESCRIPTION = """Compute once what an estimator needs, and save it for `warp-gi render --bake FILE`.
 

@@ -23,12 +23,13 @@ from warp_gi.cli.options import flag, parse_options, value_given
 from warp_gi.cli.report import Reporter, start_warp
 from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.files import check_writable, remove_stale_parts
-from warp_gi.pipeline import TERMS, Estimator, Pipeline
+from warp_gi.frame import TERMS, Frame
+from warp_gi.pipeline import Pipeline, estimator_named
 from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.environment import Environment
 from warp_gi.scene.scene import Scene
-from warp_gi.scheduler import Frame, FrameScheduler
+from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence.frames import (
     frame_attributes,
     frame_path,
@@ -158,7 +159,6 @@ def pipeline_named(text: str) -> Pipeline:
     """
     name, *changes = text.split(",")
     pipeline = Pipeline.preset(name.strip())
-    known = {estimator.__name__: estimator for estimator in _subclasses(Estimator)}
     for change in changes:
         term, _, estimator = (part.strip() for part in change.partition("="))
         if term == "denoise":
@@ -168,21 +168,14 @@ def pipeline_named(text: str) -> Pipeline:
             raise unknown_name("term of a pipeline", term, (*TERMS, "denoise"))
         if estimator.lower() == "none":
             pipeline = replace(pipeline, **{term: None})
-        elif estimator in known:
-            pipeline = replace(pipeline, **{term: known[estimator]()})
         else:
-            raise unknown_name(f"{term} estimator", estimator, [k for k, v in known.items() if v.term == term])
+            pipeline = replace(pipeline, **{term: estimator_named(term, estimator)})
     return pipeline
 
 
 def _denoiser(name: str) -> str | None:
     """Return what a pipeline takes for "none", "oidn", "SpatioTemporal"."""
     return None if name.lower() == "none" else name.lower()
-
-
-def _subclasses(base: type) -> list[type]:
-    direct = base.__subclasses__()
-    return [c for c in direct if not c.__name__.startswith("_")] + [c for d in direct for c in _subclasses(d)]
 
 
 def run(options: Render, report: Reporter) -> None:

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import warp as wp
 
 from warp_gi.errors import OptionError, SceneError, unknown_name
+from warp_gi.kernels import gbuffer
 
 if TYPE_CHECKING:
     from warp_gi.scene.scene import Scene
@@ -318,3 +320,17 @@ def _hermite(times: np.ndarray, rows: np.ndarray, time: float) -> np.ndarray:
         + (3 * s**2 - 2 * s**3) * rows[i + 1]
         + (s**3 - s**2) * h * slopes[i + 1]
     )
+
+
+def camera_data(camera: Camera) -> gbuffer.CameraData:
+    """Return the camera as kernels read it."""
+    width, height = camera.resolution
+    right, up, back = camera.world_from_camera[:3, :3].T
+    half = math.tan(math.radians(camera.hfov) / 2)
+    data = gbuffer.CameraData()
+    data.position = wp.vec3(*camera.position)
+    data.right = wp.vec3(*(right * half))
+    data.up = wp.vec3(*(up * half * height / width))
+    data.forward = wp.vec3(*-back)
+    data.width, data.height = width, height
+    return data

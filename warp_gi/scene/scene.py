@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from warp_gi.alias import AliasTable
 from warp_gi.errors import SceneError, unknown_name
 from warp_gi.forks import Guard
 from warp_gi.kernels import types
@@ -298,6 +299,12 @@ class Scene:
         """
         self._edits.check()
 
+    def light_table(self, device: str | wp.Device | None = None) -> wp.array:
+        """Return an alias table that picks emitters by power, AliasBucket [emitter_count]; built once a device."""
+        with self.lock:
+            self.data(device)
+            return self._devices[_device(device).alias].light_table()
+
     def bvh(self, device: str | wp.Device | None = None) -> Any:
         """Return the TriangleBvh behind ``data(device)``."""
         self.data(device)
@@ -368,9 +375,15 @@ class _DeviceScene:
         masks = alpha_masks(flat, scene.materials, images, data.textures, data.texels)
         self.bvh = TriangleBvh(flat.points, flat.indices, device=device.alias, alpha=masks)
         self._masks, self._resting_bvh = masks, None
+        self._light_table: wp.array | None = None
         data.bvh = self.bvh.data
         self.data = data
         self.set_environment(scene.environment)
+
+    def light_table(self) -> wp.array:
+        if self._light_table is None:
+            self._light_table = AliasTable.build(self.scene.emitter_powers()).on(self.device)
+        return self._light_table
 
     def resting_bvh(self) -> Any:
         if not self.scene.is_animated:

@@ -22,9 +22,14 @@ class Dependence:
     """How the frames of a sequence depend on those before them."""
 
     on_past: tuple[str, ...]
-    """Terms whose estimator makes them depend, and "denoiser"."""
+    """Places in the pipeline of what makes them depend: terms, "indirect.ends_in", "denoiser", names of services."""
     unsaved: tuple[str, ...]
     """Those among them whose state no file keeps."""
+
+    @property
+    def kind(self) -> str:
+        """ "independent", "saved" or "unsaved": whether frames depend on a state, and whether a file can keep it."""
+        return ("unsaved" if self.unsaved else "saved") if self.on_past else "independent"
 
     @property
     def is_saved(self) -> bool:

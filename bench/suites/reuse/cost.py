@@ -89,7 +89,7 @@ def memory_rows(case: str, run: FrameRun) -> list[Row]:
     cache = state("emitters")
     if cache is not None:
         parts |= {"cache: tables": cache.tables, "cache: lists": cache.known, "cache: lights": cache.shapes}
-    parts["samples"] = run.frame.regions.data.records
+    parts["samples"] = run.frame.paths.regions.data.records
     leaves, sizes = state("octree").leaf_count, {name: nbytes(part) for name, part in parts.items()}
     rows: list[Row] = []
     for name, size in {**sizes, "all": sum(sizes.values())}.items():

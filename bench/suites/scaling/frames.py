@@ -83,7 +83,7 @@ def light_row(scheduler: gi.FrameScheduler, taken: Taken[np.ndarray]) -> Row:
     """Return what frames took, how noisy they are, and the memory that lights have in one more frame."""
     frame = scheduler.frame(len(taken.wall) + 1)
     row = taken.row("frame ") | {"relative error": noise(taken.results)}
-    return row | {"lights MB": device_bytes(frame.data.emitters, frame.lights.data) / 1e6}
+    return row | {"lights MB": device_bytes(frame.data.emitters, frame.paths.lights.data) / 1e6}
 
 
 def _loaded(scene: gi.Scene, device: str) -> gi.Scene:
@@ -168,7 +168,7 @@ def picture(preset: str, size: float, device: str, threads: int) -> tuple[Taken,
     peak = PeakMemory()
     scheduler = gi.FrameScheduler(scene, camera.at_resolution(*resolution_of(size)), pipeline, device)
     scheduler.bake()
-    turns, learns = 1 if size > MANY_PIXELS else PIXEL_TURNS, any(one.learns for _, one in pipeline.estimators())
+    turns, learns = 1 if size > MANY_PIXELS else PIXEL_TURNS, bool(pipeline.services())
     taken = take_turns({"": lambda index: render(scheduler, index)}, turns, device, warm=learns)[""]
     return taken, peak.bytes
 

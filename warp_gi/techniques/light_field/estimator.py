@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
@@ -16,9 +16,15 @@ from warp_gi.errors import BakeError, OptionError, check_whole, unknown_name
 from warp_gi.estimator import Ahead, Estimator
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_trace as trace_kernels
+from warp_gi.primary import Primary
 from warp_gi.scene.camera import Camera, CameraPath
-from warp_gi.techniques.light_field.places import MOST_PROBES, camera_rows, cameras_of, map_resolution
+from warp_gi.techniques.light_field.places import MOST_PROBES, camera_rows, cameras_of, lit_data, map_resolution
 from warp_gi.techniques.light_field.state import ProbeState, path_settings, sky_bytes
+
+if TYPE_CHECKING:
+    from warp_gi.frame import Frame
+    from warp_gi.scene.baked import BakedScene
+    from warp_gi.scene.scene import Scene
 
 _MODES = {
     "irradiance": trace_kernels.MODE_IRRADIANCE,
@@ -125,14 +131,14 @@ class LightFieldProbes(Estimator):
 
     # ---- bake ----
 
-    def bake_key(self, scene: Any) -> str:
+    def bake_key(self, scene: Scene | BakedScene) -> str:
         """Return the hash of geometry, materials and lights. A changed sky needs no new bake: probes adapt to it.
 
         They do so in some frames if it changes while frames are rendered, before the first one else.
         """
         return scene.contents_hash
 
-    def bake_settings(self, scene: Any) -> dict[str, Any]:
+    def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Any]:
         """Return the settings that decide the maps."""
         names = ("spacing", "resolution", "irradiance_resolution", "rays", "bounces", "tolerance", "relocate")
         counts = "x".join(str(int(n)) for n in self.counts)
@@ -140,7 +146,7 @@ class LightFieldProbes(Estimator):
 
     def bake(
         self,
-        scene: Any,
+        scene: Scene,
         device: str,
         seed: int = 0,
         progress: Callable[[float], None] | None = None,
@@ -155,12 +161,12 @@ class LightFieldProbes(Estimator):
         state.bake(scene, progress)
         return state.to_bake(scene)
 
-    def start(self, scene: Any, device: str, bake: Bake | None, seed: int = 0) -> ProbeState:
+    def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> ProbeState:
         """Return the state of probes that hold a bake; under another sky than its own they are filled again."""
         target = launch.get_device(device)
         state = ProbeState(scene, target, self, seed, bake)
         if scene.triangle_count and not np.array_equal(bake.arrays["sky"], sky_bytes(scene)):
-            state.fill(scene, state.lit_data(scene))
+            state.fill(scene, lit_data(scene, state.device))
         state.key = _key(scene, 0.0)
         return state
 
@@ -203,15 +209,15 @@ class LightFieldProbes(Estimator):
         return max(map_resolution(self.resolution, MOST_PROBES), self.irradiance_resolution)
 
     @property
-    def makes_primary(self) -> bool:
-        """Whether camera rays are traced through the probes."""
-        return self.primary == "probes"
+    def own_primary(self) -> Primary | None:
+        """Camera rays through the probes, if they are to be traced there."""
+        return ProbeRays() if self.primary == "probes" else None
 
-    def depends_on_past(self, scene: Any, ahead: Ahead | None = None) -> bool:
+    def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
         """Return whether the sky changes, as probes begin with that of the first frame, or they follow what moves."""
         return ahead is None or ahead.sky_changes or (self.update > 0 and scene.is_animated)
 
-    def preprocess(self, frame: Any, state: ProbeState) -> ProbeState:
+    def preprocess(self, frame: Frame, state: ProbeState) -> ProbeState:
         """Refresh some probes, if the sky or a pose is not what they saw."""
         key = _key(frame.scene, frame.time)
         if key != state.key:
@@ -221,7 +227,7 @@ class LightFieldProbes(Estimator):
         if self.update and state.pending.any():
             state = state.copied(with_maps=True)
             probes = state.take_stale(self.update)
-            state.refresh(frame.scene, state.lit_data(frame.scene), probes)
+            state.refresh(frame.scene, lit_data(frame.scene, state.device), probes)
         return state
 
     @property
@@ -230,7 +236,7 @@ class LightFieldProbes(Estimator):
         fading = math.ceil(math.log(SETTLED) / math.log(self.hysteresis)) if self.hysteresis > 0 else 1
         return max(fading, 4)
 
-    def trace(self, frame: Any, state: ProbeState) -> None:
+    def trace(self, frame: Frame, state: ProbeState) -> None:
         """Add the light of the current camera sample."""
         settings = frame.pass_settings
         query = trace_kernels.ProbeQuery()
@@ -240,7 +246,7 @@ class LightFieldProbes(Estimator):
         if self.pixel_rays:
             query.rays, query.first_ray, query.ray_bits = _evenly(self.pixel_rays, settings)
         unseen = query.rays, query.first_ray, query.ray_bits
-        if (self.pixel_rays or frame.pipeline.spp) < UNSEEN_RAYS:
+        if (self.pixel_rays or frame.settings.spp) < UNSEEN_RAYS:
             unseen = _evenly(UNSEEN_RAYS, settings)
         query.unseen_rays, query.first_unseen_ray, query.unseen_ray_bits = unseen
         query.paths = path_settings(frame.scene)
@@ -249,12 +255,19 @@ class LightFieldProbes(Estimator):
         buffers.moment1, buffers.moment2 = frame.moments("indirect")
         if (lobes := frame.lobes()) is not None:
             buffers.diffuse, buffers.glossy = lobes
-        data = state.lit_data(frame.scene)
+        data = lit_data(frame.scene, state.device)
         inputs = [data, frame.camera_data, settings, state.field, query, frame.hits, buffers]
         frame.launch_tiled(trace_kernels.trace_probes, inputs)
 
-    def trace_primary(self, frame: Any, state: ProbeState) -> None:
-        """Fill the buffers by what camera rays meet in the probes (light_field_probes.txt, Fig. 20)."""
+
+@dataclass(frozen=True)
+class ProbeRays(Primary):
+    """Camera rays through light field probes, which hold all light: no geometry is needed (paper, Fig. 20)."""
+
+    is_whole: ClassVar[bool] = True
+
+    def trace(self, frame: Frame, state: ProbeState) -> None:
+        """Fill the buffers by what camera rays meet in the probes."""
         buffers = frame.struct(trace_kernels.ProbeView)
         inputs = [frame.camera_data, frame.pass_settings, state.field, buffers]
         frame.launch_tiled(trace_kernels.view_probes, inputs)
@@ -266,7 +279,7 @@ def _evenly(rays: int, settings: Any) -> tuple[int, int, int]:
     return each, settings.camera_sample * each, (each * settings.camera_samples - 1).bit_length()
 
 
-def _key(scene: Any, time: float) -> str:
+def _key(scene: Scene | BakedScene, time: float) -> str:
     """Return what the light in the probes depends on beside geometry, materials and lights: the sky, and poses."""
     sky = "" if scene.environment is None else scene.environment.content_hash
     poses = [scene.world_from_node(index, time).tobytes() for index in range(len(scene.nodes)) if scene.moves(index)]

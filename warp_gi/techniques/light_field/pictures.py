@@ -11,13 +11,14 @@ import numpy as np
 import warp as wp
 
 from warp_gi.baking import Bake
+from warp_gi.frame import Frame
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_march as march_kernels
 from warp_gi.kernels import light_field_trace as trace_kernels
 from warp_gi.pipeline import Pipeline
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.scene import Scene
-from warp_gi.scheduler import Frame, FrameScheduler
+from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence.preview import magma, tone_map, write_pngs
 from warp_gi.techniques.light_field.estimator import VISIBILITIES
 from warp_gi.techniques.light_field.export import probe_maps

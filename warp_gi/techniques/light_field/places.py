@@ -16,12 +16,11 @@ import numpy as np
 import warp as wp
 
 from warp_gi import launch
-from warp_gi.alias import AliasTable
 from warp_gi.errors import OptionError
 from warp_gi.kernels import light_field_place as kernels
 from warp_gi.kernels import types
-from warp_gi.scene.camera import Camera, CameraPath
-from warp_gi.techniques.paths.estimators import sky_probability
+from warp_gi.paths import sky_probability
+from warp_gi.scene.camera import Camera, CameraPath, camera_data
 
 AUTOMATIC_PROBES = 440
 """Most that there are where neither counts nor spacing are given."""
@@ -164,8 +163,6 @@ def seen_space(scene: Any, cameras: Sequence[Camera], device: wp.Device) -> Spac
     Points count by one over their distance from the camera: a surface twice as far shows half the detail, and a plane
     to the horizon, which fills a tenth of a picture, does not stretch the box to a hundred times what stands on it.
     """
-    from warp_gi.scheduler import camera_data  # the scheduler imports the techniques
-
     along, points, weights, first = int(kernels.REACH_VERTICES), [], [], []
     ways = left = 0
     for number, camera in enumerate(cameras):
@@ -292,5 +289,5 @@ def lit_data(scene: Any, device: wp.Device) -> types.SceneData:
     data = launch.copied(scene.data(device), types.SceneData)
     data.emitters = launch.copied(data.emitters, types.Emitters)
     if scene.emitter_count:
-        data.emitters.alias = AliasTable.build(scene.emitter_powers()).on(device)
+        data.emitters.alias = scene.light_table(device)
     return data

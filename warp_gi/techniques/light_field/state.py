@@ -17,6 +17,7 @@ from warp_gi.baking import Bake
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_bake as bake_kernels
 from warp_gi.kernels import path_trace, types
+from warp_gi.paths import sky_probability
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.techniques.light_field.places import (
     ProbeGrid,
@@ -27,7 +28,7 @@ from warp_gi.techniques.light_field.places import (
     place_grid,
     relocate,
 )
-from warp_gi.techniques.paths.estimators import BsdfPaths, sky_probability
+from warp_gi.techniques.paths.estimators import BsdfPaths
 
 LIGHT_RESOLUTION, DISTANCE_RESOLUTION = 32, 64
 """Texels along a side of what irradiance and moments are filtered from, each the mean over the texels in it."""
@@ -96,7 +97,6 @@ class ProbeState:
         self.pending = np.zeros(self.grid.probe_count, np.int32)
         """Refreshes that each probe still needs."""
         self._cursor = 0
-        self._alias: Any = None
         self.field = self._empty_field(bounds.astype(np.float64))
         if bake is not None:
             self._load(bake)
@@ -130,21 +130,11 @@ class ProbeState:
     def _array(self, values: np.ndarray, dtype: Any) -> wp.array:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
 
-    def lit_data(self, scene: Any) -> types.SceneData:
-        """Return ``light_field_places.lit_data`` of the scene's pose, whose table of emitters is made once."""
-        data = launch.copied(scene.data(self.device), types.SceneData)
-        data.emitters = launch.copied(data.emitters, types.Emitters)
-        if scene.emitter_count:
-            if self._alias is None:
-                self._alias = lit_data(scene, self.device).emitters.alias
-            data.emitters.alias = self._alias
-        return data
-
     # ---- filling ----
 
     def bake(self, scene: Any, progress: Callable[[float], None] | None = None) -> None:
         """Place all probes, and fill them."""
-        data = self.lit_data(scene)
+        data = lit_data(scene, self.device)
         if self.settings.relocate:
             relocate(scene, data, self.grid, self.field, self.device)
         self._announce(scene, data)

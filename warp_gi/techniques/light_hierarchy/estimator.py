@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import warp as wp
 
 from warp_gi import launch
-from warp_gi.estimator import Estimator, SamplerInUse
-from warp_gi.kernels import light_hierarchy, path_trace
+from warp_gi.estimator import Ahead, Estimator
+from warp_gi.kernels import light_hierarchy
 from warp_gi.techniques.light_hierarchy import tree as light_tree
+
+if TYPE_CHECKING:
+    from warp_gi.baking import Bake
+    from warp_gi.frame import Frame
+    from warp_gi.scene.baked import BakedScene
+    from warp_gi.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -25,29 +31,31 @@ class LightHierarchy(Estimator):
 
     term: ClassVar[str] = "emitters"
 
-    def bake_key(self, scene: Any) -> str:
+    def bake_key(self, scene: Scene | BakedScene) -> str:
         """Return a hash of all but the sky."""
         return scene.contents_hash
 
-    def start(self, scene: Any, device: str, bake: Any, seed: int = 0) -> TreeState | None:
+    def start(
+        self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0
+    ) -> TreeState | None:
         """Return the tree over the lights at time 0."""
         return first_tree(scene, launch.get_device(device))
 
-    def depends_on_past(self, scene: Any, ahead: Any = None) -> bool:
+    def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
         """Return False: the tree's shape is that at time 0, and its bounds are those of the frame's lights."""
         return False
 
-    def preprocess(self, frame: Any, state: TreeState | None) -> TreeState | None:
+    def preprocess(self, frame: Frame, state: TreeState | None) -> TreeState | None:
         """Bring the tree up to the frame's lights, and give it to the paths."""
         if state is None:
             return None
         state = moved_tree(frame, state)
-        frame.lights = SamplerInUse(light_hierarchy.HIERARCHY_LIGHTS, state.data)
+        frame.paths.use_lights(light_hierarchy.HIERARCHY_LIGHTS, state.data)
         return state
 
-    def trace(self, frame: Any, state: Any) -> None:
-        """Ask the shared path launch for this term."""
-        frame.request_paths(path_trace.TERM_EMITTERS)
+    def trace(self, frame: Frame, state: TreeState | None) -> None:
+        """Ask the path tracer for this term."""
+        frame.paths.want(self.term)
 
 
 @dataclass(frozen=True)
@@ -59,7 +67,7 @@ class TreeState:
     data: light_hierarchy.LightTree
 
 
-def first_tree(scene: Any, device: wp.Device) -> TreeState | None:
+def first_tree(scene: Scene, device: wp.Device) -> TreeState | None:
     """Return the tree over a scene's lights as they are, at time 0 before the first frame; None if there are none.
 
     Its shape stays, so that frames do not depend on which of them was the first.
@@ -71,7 +79,7 @@ def first_tree(scene: Any, device: wp.Device) -> TreeState | None:
     return TreeState(tree, bounds, light_tree.to_device(tree, device))
 
 
-def moved_tree(frame: Any, state: TreeState) -> TreeState:
+def moved_tree(frame: Frame, state: TreeState) -> TreeState:
     """Return the tree with its boxes and cones around the lights of a frame."""
     if frame.scene.is_animated:
         bounds = light_tree.emitter_bounds(frame.scene, frame.data)

@@ -1,17 +1,25 @@
-"""The reference estimators. They share one path-tracing launch (``Frame.request_paths``)."""
+"""The baselines. They share one path-tracing launch (``Frame.paths``)."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+import warp as wp
 
+from warp_gi import launch
 from warp_gi.alias import AliasTable
 from warp_gi.errors import OptionError
 from warp_gi.estimator import Estimator
-from warp_gi.kernels import path_trace
+from warp_gi.kernels import path_samplers
+from warp_gi.radiance_cache import RadianceCache
+
+if TYPE_CHECKING:
+    from warp_gi.baking import Bake
+    from warp_gi.frame import Frame
+    from warp_gi.scene.baked import BakedScene
+    from warp_gi.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -23,55 +31,42 @@ class TracedEnvironment(Estimator):
 
     term: ClassVar[str] = "environment"
 
-    def trace(self, frame: Any, state: Any) -> None:
-        """Ask the shared path launch for this term."""
-        frame.request_paths(path_trace.TERM_ENVIRONMENT)
+    def trace(self, frame: Frame, state: Any) -> None:
+        """Ask the path tracer for this term."""
+        frame.paths.want(self.term)
 
 
 @dataclass(frozen=True)
-class _SampledLights(Estimator):
-    """Direct light from emitters picked by a fixed distribution. Unbiased."""
+class UniformLights(Estimator):
+    """Direct light from emissive triangles and punctual lights, each equally likely to be sampled. Unbiased."""
 
     term: ClassVar[str] = "emitters"
 
-    def weights(self, scene: Any) -> np.ndarray:
-        """Return relative selection probabilities, float64 [emitter_count]."""
-        raise NotImplementedError
+    def bake_key(self, scene: Scene | BakedScene) -> str:
+        """Return a hash of all but the sky."""
+        return scene.contents_hash
 
-    def depends_on_past(self, scene: Any, ahead: Any = None) -> bool:
-        """Return False: powers stay, so every frame has the same table."""
-        return False
-
-    def preprocess(self, frame: Any, state: Any) -> Any:
-        """Fill the alias table that every path vertex of the frame uses."""
-        if frame.scene.emitter_count == 0:
+    def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> wp.array | None:
+        """Return an alias table of equal probabilities, AliasBucket [emitter]; None without emitters."""
+        if scene.emitter_count == 0:
             return None
-        if state is None:
-            state = AliasTable.build(self.weights(frame.scene)).on(frame.device)
-        frame.data.emitters.alias = state
-        return state
+        return AliasTable.build(np.ones(scene.emitter_count)).on(launch.get_device(device))
 
-    def trace(self, frame: Any, state: Any) -> None:
-        """Ask the shared path launch for this term."""
-        frame.request_paths(path_trace.TERM_EMITTERS)
+    def trace(self, frame: Frame, state: wp.array | None) -> None:
+        """Ask the path tracer for this term, and to pick lights by the table."""
+        frame.paths.use_lights(path_samplers.ALIAS_LIGHTS, path_samplers.AliasLights(), state)
+        frame.paths.want(self.term)
 
 
 @dataclass(frozen=True)
-class UniformLights(_SampledLights):
-    """Direct light from emissive triangles and punctual lights, each equally likely to be sampled. Unbiased."""
-
-    def weights(self, scene: Any) -> np.ndarray:
-        """Return ones."""
-        return np.ones(scene.emitter_count)
-
-
-@dataclass(frozen=True)
-class PowerLights(_SampledLights):
+class PowerLights(Estimator):
     """Direct light from emissive triangles and punctual lights, sampled in proportion to their power. Unbiased."""
 
-    def weights(self, scene: Any) -> np.ndarray:
-        """Return each emitter's power."""
-        return scene.emitter_powers()
+    term: ClassVar[str] = "emitters"
+
+    def trace(self, frame: Frame, state: Any) -> None:
+        """Ask the path tracer for this term; it picks lights by power unless told otherwise."""
+        frame.paths.want(self.term)
 
 
 @dataclass(frozen=True)
@@ -91,6 +86,9 @@ class BsdfPaths(Estimator):
     """Paths of this many edges and more end at random, by their throughput or the reflectance they met, the larger."""
     clamp: float = 0.0
     """Largest component of one path's radiance, W/(m^2 sr); darkens fireflies. 0 is no limit."""
+    ends_in: RadianceCache | None = None
+    """Radiance cache in which paths end at their second vertex, or None: direct light is sampled there as without
+    it, and all other light is what the cache knows. Where it knows nothing a path goes on."""
 
     def validate(self) -> None:
         """Raise OptionError for depths below 2 or a negative clamp."""
@@ -100,22 +98,14 @@ class BsdfPaths(Estimator):
             raise OptionError(f"roulette_depth must be at least 2, got {self.roulette_depth}")
         if not self.clamp >= 0:
             raise OptionError(f"clamp must be 0 (no limit) or a radiance above it, got {self.clamp}")
+        if not isinstance(self.ends_in, RadianceCache | None):
+            raise OptionError(f"ends_in must be a radiance cache or None, got {self.ends_in!r:.80}")
 
-    def trace(self, frame: Any, state: Any) -> None:
-        """Ask the shared path launch for this term."""
-        frame.request_paths(path_trace.TERM_INDIRECT, self)
+    @property
+    def radiance_cache(self) -> RadianceCache | None:
+        """The cache that paths end in."""
+        return self.ends_in
 
-
-def sky_probability(scene: Any) -> float:
-    """Return how often a path vertex samples the sky rather than an emitter: by power, but neither under a fifth.
-
-    A sky sends pi radius^2 times its integral over the sphere into the scene; walls keep most of that out of a room.
-    """
-    environment = scene.environment
-    if environment is None or environment.pixels is None:
-        return 0.0
-    if scene.emitter_count == 0:
-        return 1.0
-    sky = 4.0 * math.pi**2 * scene.radius**2 * float(environment.mean_radiance @ (0.2126, 0.7152, 0.0722))
-    emitters = float(scene.emitter_powers().sum())
-    return min(max(sky / max(sky + emitters, 1e-30), 0.2), 0.8)
+    def trace(self, frame: Frame, state: Any) -> None:
+        """Ask the path tracer for this term."""
+        frame.paths.want(self.term, self.max_depth, self.roulette_depth, self.clamp)

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import warp as wp
 
 from warp_gi import launch
 from warp_gi.errors import OptionError, check_whole
-from warp_gi.estimator import SamplerInUse
 from warp_gi.kernels import guided_directions, guided_shares, quadtree, quadtree_adapt
 from warp_gi.techniques.paths.estimators import BsdfPaths
-from warp_gi.techniques.reuse.sample_octree import Lesson
+from warp_gi.techniques.reuse.sample_octree import Lesson, SampleOctree
+
+if TYPE_CHECKING:
+    from warp_gi.baking import Bake
+    from warp_gi.frame import Frame
+    from warp_gi.scene.baked import BakedScene
+    from warp_gi.scene.scene import Scene
+    from warp_gi.service import Service
 
 BITS = (32, 64, 96, 128)
 
@@ -61,15 +67,20 @@ class GuidedPaths(BsdfPaths):
             raise OptionError(f"bsdf_share must be from 0.02 to 0.98, got {self.bsdf_share}")
 
     @property
-    def learns(self) -> bool:
-        """Regions are learnt from samples."""
+    def services(self) -> tuple[Service, ...]:
+        """Regions, and samples in them."""
+        return (SampleOctree(),)
+
+    @property
+    def saves_state(self) -> bool:
+        """The quadtrees hold all that frames before left."""
         return True
 
-    def bake_key(self, scene: Any) -> str:
+    def bake_key(self, scene: Scene | BakedScene) -> str:
         """Return a hash of all but the sky."""
         return scene.contents_hash
 
-    def start(self, scene: Any, device: str, bake: Any, seed: int = 0) -> GuideState:
+    def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> GuideState:
         """Return even quadtrees for the eight leaves of the first octree."""
         device = launch.get_device(device)
         guides = _guides(8, self.bits, device)
@@ -77,14 +88,19 @@ class GuidedPaths(BsdfPaths):
         guides.shares.fill_(wp.vec2(self.bsdf_share, self.bsdf_share))
         return self._counted(guides, device)
 
-    def preprocess(self, frame: Any, state: GuideState) -> GuideState:
+    def preprocess(self, frame: Frame, state: GuideState) -> GuideState:
         """Give paths the quadtrees."""
         data = guided_directions.GuidedDirections()
         data.bits, data.stratified = self.bits, int(self.stratified)
         data.trees, data.shares, data.counts = state.guides.trees, state.guides.shares, state.counts
         data.anchors = state.guides.anchors
-        frame.directions = SamplerInUse(guided_directions.GUIDED_DIRECTIONS, data)
+        frame.paths.use_directions(guided_directions.GUIDED_DIRECTIONS, data)
         return state
+
+    def after(self, frame: Frame, state: GuideState) -> GuideState:
+        """Learn from the samples of the frame."""
+        lesson = frame.offered(Lesson)
+        return state if lesson is None else self.learn(lesson, state)
 
     def learn(self, lesson: Lesson, state: GuideState) -> GuideState:
         """Adapt the quadtrees to the samples of the frame."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import warp as wp
@@ -11,11 +11,18 @@ import warp as wp
 from warp_gi import launch
 from warp_gi.alias import AliasTable
 from warp_gi.errors import OptionError, check_whole, unknown_name
-from warp_gi.estimator import Estimator, SamplerInUse
-from warp_gi.kernels import light_cache, light_cache_build, light_cache_native, path_trace, types
+from warp_gi.estimator import Estimator
+from warp_gi.kernels import light_cache, light_cache_build, light_cache_native, types
 from warp_gi.techniques.light_hierarchy.estimator import TreeState, first_tree, moved_tree
-from warp_gi.techniques.reuse.sample_octree import Lesson, running_sums
+from warp_gi.techniques.reuse.sample_octree import Lesson, SampleOctree, running_sums
 from warp_gi.techniques.shared.ltc import ltc_table
+
+if TYPE_CHECKING:
+    from warp_gi.baking import Bake
+    from warp_gi.frame import Frame
+    from warp_gi.scene.baked import BakedScene
+    from warp_gi.scene.scene import Scene
+    from warp_gi.service import Service
 
 EXPLORES_BY = ("hierarchy", "table")
 LEAST_EXPLORATION, MOST_EXPLORATION = 0.05, 0.75
@@ -76,15 +83,22 @@ class VisibilityLightCache(Estimator):
             )
 
     @property
-    def learns(self) -> bool:
-        """Regions are learnt from samples."""
+    def services(self) -> tuple[Service, ...]:
+        """Regions, and samples in them."""
+        return (SampleOctree(),)
+
+    @property
+    def saves_state(self) -> bool:
+        """The caches hold all that frames before left."""
         return True
 
-    def bake_key(self, scene: Any) -> str:
+    def bake_key(self, scene: Scene | BakedScene) -> str:
         """Return a hash of all but the sky."""
         return scene.contents_hash
 
-    def start(self, scene: Any, device: str, bake: Any, seed: int = 0) -> CacheState | None:
+    def start(
+        self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0
+    ) -> CacheState | None:
         """Return empty caches for the eight leaves of the first octree."""
         if scene.emitter_count == 0:
             return None
@@ -100,7 +114,7 @@ class VisibilityLightCache(Estimator):
         luminances = launch.on_device(radiances.astype(np.float32), wp.float32, device)
         return CacheState(self._tables(8, device), _lists(8, device), places, tree, luminances)
 
-    def preprocess(self, frame: Any, state: CacheState | None) -> CacheState | None:
+    def preprocess(self, frame: Frame, state: CacheState | None) -> CacheState | None:
         """Bring the shapes of lights and the table of exploration up to the frame, and give paths the cache."""
         if state is None:
             return None
@@ -123,11 +137,12 @@ class VisibilityLightCache(Estimator):
         cache.shapes, cache.emitters = state.shapes, state.emitters
         cache.ltc, cache.tables = ltc_table(device), state.tables
         if self.explores_by == "hierarchy":
+            table = None
             state = replace(state, tree=moved_tree(frame, state.tree))
             cache.explores_by_tree, cache.tree = 1, state.tree.data
         else:
-            emitters.alias = AliasTable.build(self._table(frame, moved, state.places[:, :3])).on(device)
-        frame.lights = SamplerInUse(light_cache.CACHED_LIGHTS, cache)
+            table = AliasTable.build(self._table(frame, moved, state.places[:, :3])).on(device)
+        frame.paths.use_lights(light_cache.CACHED_LIGHTS, cache, table)
         return state
 
     def _tables(self, leaves: int, device: wp.Device) -> light_cache.CacheTables:
@@ -144,7 +159,7 @@ class VisibilityLightCache(Estimator):
         tables.excesses = wp.zeros(leaves, dtype=wp.float32, device=device)
         return tables
 
-    def _table(self, frame: Any, moved: np.ndarray, centers: np.ndarray) -> np.ndarray:
+    def _table(self, frame: Frame, moved: np.ndarray, centers: np.ndarray) -> np.ndarray:
         """Return the relative probabilities of exploring each light (section 4.3)."""
         powers = frame.scene.emitter_powers()
         away = np.linalg.norm(centers - np.asarray(frame.camera.position, np.float64), axis=1)
@@ -155,9 +170,14 @@ class VisibilityLightCache(Estimator):
                 weights += share * part / part.sum()
         return weights
 
-    def trace(self, frame: Any, state: Any) -> None:
-        """Ask the shared path launch for this term."""
-        frame.request_paths(path_trace.TERM_EMITTERS)
+    def trace(self, frame: Frame, state: CacheState | None) -> None:
+        """Ask the path tracer for this term."""
+        frame.paths.want(self.term)
+
+    def after(self, frame: Frame, state: CacheState | None) -> CacheState | None:
+        """Learn from the samples of the frame, if any were kept."""
+        lesson = frame.offered(Lesson)
+        return state if lesson is None else self.learn(lesson, state)
 
     def learn(self, lesson: Lesson, state: CacheState | None) -> CacheState | None:
         """Make the caches of the next frame from the samples of this one."""

@@ -11,16 +11,17 @@ import numpy as np
 import warp as wp
 
 from warp_gi import launch
-from warp_gi.alias import AliasTable
 from warp_gi.errors import OptionError
+from warp_gi.frame import Frame
 from warp_gi.kernels import reuse_pictures as kernels
 from warp_gi.kernels import types
-from warp_gi.scene.camera import Camera
-from warp_gi.scheduler import Frame, FrameScheduler, camera_data
+from warp_gi.paths import sky_probability
+from warp_gi.scene.camera import Camera, camera_data
+from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence.preview import magma, to_bytes, write_pngs
 from warp_gi.techniques.light_field.ray import probe_color
 from warp_gi.techniques.light_field.state import low_directions
-from warp_gi.techniques.paths.estimators import TracedEnvironment, sky_probability
+from warp_gi.techniques.paths.estimators import TracedEnvironment
 from warp_gi.techniques.reuse.guided_paths import GuidedPaths
 from warp_gi.techniques.reuse.light_cache import VisibilityLightCache
 from warp_gi.techniques.shared.legends import round_above, scale_bar, stacked, with_keys
@@ -98,7 +99,7 @@ def check_pictures(scheduler: FrameScheduler, camera: Camera, pixel: tuple[int, 
     Whether the pixel has a surface is known where nothing moves.
     """
     pipeline = scheduler.pipeline
-    if not scheduler.learns:
+    if "octree" not in pipeline.services():
         raise OptionError(
             "pictures of reuse show what is learnt from samples, and no estimator of this pipeline learns; the preset "
             '"reuse" does'
@@ -248,7 +249,7 @@ def incident_light(scheduler: FrameScheduler, frame: Frame, origin: np.ndarray, 
     data = launch.copied(frame.data, types.SceneData)
     data.emitters = launch.copied(data.emitters, types.Emitters)
     if scene.emitter_count:
-        data.emitters.alias = AliasTable.build(scene.emitter_powers()).on(frame.device)
+        data.emitters.alias = scene.light_table(frame.device)
     incident = kernels.IncidentMap()
     incident.origin, incident.normal = wp.vec3(*origin.tolist()), wp.vec3(*normal.tolist())
     incident.resolution, incident.rays, incident.seed = MAP_TEXELS, MAP_RAYS, frame.seed

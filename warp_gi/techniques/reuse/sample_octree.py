@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -11,19 +11,30 @@ import warp as wp
 from warp_gi import launch
 from warp_gi.errors import OptionError, check_whole
 from warp_gi.kernels import octree, samples
+from warp_gi.service import Service
+
+if TYPE_CHECKING:
+    from warp_gi.baking import Bake
+    from warp_gi.frame import Frame
+    from warp_gi.paths import PathRequest
+    from warp_gi.scene.baked import BakedScene
+    from warp_gi.scene.scene import Scene
 
 MOST_SAMPLES = 1 << 28
+MOST_VERTICES = 7  # of a path whose samples are kept: each path has room for as many, so more would keep fewer paths
 SLICES_PER_THREAD = 4
 MOST_CELLS = 1 << 24  # offsets of inner nodes have 24 bits
 
 
 @dataclass(frozen=True)
-class SampleOctree:
+class SampleOctree(Service):
     """An octree over the points where paths scatter, as fine as there are samples to learn from.
 
     A cell is split where it holds more than ``split`` samples of a frame, by as many levels at once as that needs, and
     given up where it holds fewer than ``collapse`` (temporal_reuse.txt, section 6).
     """
+
+    name: ClassVar[str] = "octree"
 
     split: int = 1024
     """Samples of a frame above which a leaf is split."""
@@ -32,14 +43,27 @@ class SampleOctree:
     most_samples: int = 1 << 20
     """Samples that are kept of a frame at most, 40 bytes each; of more paths, every second, third ... is recorded."""
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
+        """Raise OptionError for settings out of range."""
         for name, least in (("split", 1), ("collapse", 1), ("most_samples", 1024)):
             check_whole(f"octree.{name}", getattr(self, name), least, MOST_SAMPLES)
         if self.collapse > self.split:
             raise OptionError(f"octree.collapse must be at most octree.split ({self.split}), got {self.collapse}")
 
-    def start(self, scene: Any, device: wp.Device) -> OctreeState:
+    @property
+    def saves_state(self) -> bool:
+        """The tree is all that frames before left."""
+        return True
+
+    def bake_key(self, scene: Scene | BakedScene) -> str:
+        """Return a hash of all but the sky."""
+        return scene.contents_hash
+
+    def start(
+        self, scene: Scene | BakedScene, device: str | wp.Device, bake: Bake | None = None, seed: int = 0
+    ) -> OctreeState:
         """Return a tree whose root has eight leaves, over the cube around the scene's bounds in all of its time."""
+        device = launch.get_device(str(device))
         low, high = (corner.astype(np.float64) for corner in scene.bounds)
         edge = max(float((high - low).max()), 1e-6) * 1.001
         corner = (low + high) / 2 - edge / 2
@@ -47,11 +71,35 @@ class SampleOctree:
         cube.nodes = launch.on_device(np.array([255], np.uint32), wp.uint32, device)
         cube.low, cube.scale = wp.vec3(*corner), octree.SIDE / edge
         prefixes, levels = (wp.zeros(1, dtype=dtype, device=device) for dtype in (wp.uint32, wp.int32))
-        return OctreeState(cube, prefixes, levels, wp.zeros(8, dtype=wp.int32, device=device))
+        return OctreeState(cube, prefixes, levels, wp.zeros(8, dtype=wp.int32, device=device), SpareRecords())
 
-    def records(self, frame: Any, vertices: int, previous: samples.SampleRecords | None) -> samples.SampleRecords:
+    def preprocess(self, frame: Frame, state: OctreeState) -> OctreeState:
+        """Let samplers find regions in the tree, and leave samples for ``after``."""
+        frame.paths.use_regions(samples.SAMPLE_REGIONS, lambda paths: self._regions(frame, state, paths))
+        return state
+
+    def _regions(self, frame: Frame, state: OctreeState, paths: PathRequest) -> samples.SampleRegions:
+        """Return the tree, and empty buffers for samples, as path kernels read them."""
+        with frame.stage(f"preprocess {self.name}"):
+            regions = samples.SampleRegions()
+            regions.octree, regions.moves = state.octree, int(frame.scene.is_animated)
+            vertices = min(paths.max_depth - 1, MOST_VERTICES)
+            regions.records = self.records(frame, vertices, state.spare.take())
+        return regions
+
+    def after(self, frame: Frame, state: OctreeState) -> OctreeState:
+        """Return the tree that fits the samples of the frame, and offer a ``Lesson``; nothing if none were kept."""
+        if frame.paths.regions.sampler is not samples.SAMPLE_REGIONS:
+            return state
+        records = frame.paths.regions.data.records
+        lesson = self.learn(state, records, frame.device)
+        frame.offer(lesson)
+        state.spare.give(records)
+        return lesson.octree
+
+    def records(self, frame: Frame, vertices: int, previous: samples.SampleRecords | None) -> samples.SampleRecords:
         """Return empty buffers for the samples of a frame whose paths have ``vertices``; uses ``previous`` again."""
-        paths = frame.tiled_items * frame.pipeline.spp
+        paths = frame.tiled_items * frame.settings.spp
         stride = max(1, -(-paths * vertices // self.most_samples))
         slots = -(-paths // stride) * vertices
         records = samples.SampleRecords()
@@ -80,7 +128,7 @@ class SampleOctree:
         cube.nodes = tree.nodes
         grouped = samples.LeafSamples()
         grouped.starts, grouped.counts, grouped.order = tree.starts, counts, slots
-        grown = OctreeState(cube, tree.prefixes, tree.levels, tree.counts)
+        grown = OctreeState(cube, tree.prefixes, tree.levels, tree.counts, state.spare)
         return Lesson(grown, tree, records, grouped, neighbours, origins, device)
 
     def _build(self, state: OctreeState, codes: wp.array, device: wp.Device) -> tuple[octree.OctreeNodes, int]:
@@ -114,6 +162,25 @@ class SampleOctree:
         return tree, end
 
 
+class SpareRecords:
+    """Buffers for samples that a frame is done with, for the next frame to use again.
+
+    A frame takes them away, so that one that is interrupted, whose last launches may still write there, leaves none.
+    """
+
+    def __init__(self) -> None:
+        self.records: samples.SampleRecords | None = None
+
+    def take(self) -> samples.SampleRecords | None:
+        """Return the buffers, if there are any, and keep them no more."""
+        records, self.records = self.records, None
+        return records
+
+    def give(self, records: samples.SampleRecords) -> None:
+        """Keep buffers for the next frame."""
+        self.records = records
+
+
 @dataclass
 class OctreeState:
     """A tree, and what pictures show of it."""
@@ -125,6 +192,7 @@ class OctreeState:
     """int32 [node] 0 is the root's."""
     counts: wp.array
     """int32 [8 node + octant] samples in the cell in the last frame."""
+    spare: SpareRecords = field(default_factory=SpareRecords, metadata={"derived": True})
 
     @property
     def leaf_count(self) -> int:

@@ -12,7 +12,7 @@ from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_audit as audit_kernels
 
 if TYPE_CHECKING:
-    from warp_gi.scheduler import Frame
+    from warp_gi.frame import Frame
     from warp_gi.techniques.visibility_field.estimator import VisibilityField
 
 STATES = ("visible", "occluded", "mixed", "unknown")

@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import warp as wp
@@ -21,6 +21,11 @@ from warp_gi.kernels import visibility_field_trace as trace_kernels
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.techniques.visibility_field.bake import field_query, grid_of
 from warp_gi.techniques.visibility_field.state import RAYS_A_MILLISECOND, FieldState, cells_on_path, corners_of
+
+if TYPE_CHECKING:
+    from warp_gi.frame import Frame
+    from warp_gi.scene.baked import BakedScene
+    from warp_gi.scene.scene import Scene
 
 _MODES = {
     "three_state": field_kernels.MODE_THREE_STATE,
@@ -104,11 +109,11 @@ class VisibilityField(Estimator):
 
     # ---- bake ----
 
-    def bake_key(self, scene: Any) -> str:
+    def bake_key(self, scene: Scene | BakedScene) -> str:
         """Return the hash of the geometry: nothing else decides visibility."""
         return scene.geometry_hash
 
-    def bake_settings(self, scene: Any) -> dict[str, Any]:
+    def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Any]:
         """Return the settings that decide the masks, with the cell size in metres."""
         names = ("resolution", "samples", "rays", "dilation")
         settings = {name: int(getattr(self, name)) for name in names}
@@ -116,7 +121,7 @@ class VisibilityField(Estimator):
 
     def bake(
         self,
-        scene: Any,
+        scene: Scene,
         device: str,
         seed: int = 0,
         progress: Callable[[float], None] | None = None,
@@ -130,7 +135,7 @@ class VisibilityField(Estimator):
         state.bake(cells, progress)
         return state.to_bake()
 
-    def start(self, scene: Any, device: str, bake: Bake | None, seed: int = 0) -> FieldState:
+    def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> FieldState:
         """Return the state of a field with the masks of a bake."""
         target = launch.get_device(device)
         if bake is None:
@@ -148,7 +153,7 @@ class VisibilityField(Estimator):
     def _grows(self) -> bool:
         return self.mode != "traced" and self.lazy and self.budget > 0
 
-    def depends_on_past(self, scene: Any, ahead: Ahead | None = None) -> bool:
+    def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
         """Return whether a frame may find cells that those before it baked, or what pixels transferred then.
 
         No cells are baked on the way if nothing moves and all cells that the frames ahead see are known.
@@ -157,7 +162,7 @@ class VisibilityField(Estimator):
             return self.relight
         return ahead is None or bool(scene.moving_objects) or ahead.state.lacks(ahead.views)
 
-    def preprocess(self, frame: Any, state: FieldState) -> FieldState:
+    def preprocess(self, frame: Frame, state: FieldState) -> FieldState:
         """Bake what came into view, within the budget; draw the frame's samples; look at the sky and at what moves."""
         state = copy.copy(state)
         state.query = self._query(frame)
@@ -172,7 +177,7 @@ class VisibilityField(Estimator):
                 state.transfer_key = key
         return state
 
-    def _bake_in_view(self, frame: Any, state: FieldState) -> None:
+    def _bake_in_view(self, frame: Frame, state: FieldState) -> None:
         if self.mode == "traced":
             none = wp.empty(0, dtype=wp.int32, device=frame.device), wp.empty(0, dtype=wp.uint32, device=frame.device)
             state.upload()
@@ -187,13 +192,13 @@ class VisibilityField(Estimator):
                 state.bake_rest(cells, most_rays)
         state.upload()
 
-    def _query(self, frame: Any) -> Any:
-        size = min(-(-frame.pipeline.spp // 8) * 8, MOST_SET_SIZE)
+    def _query(self, frame: Frame) -> Any:
+        size = min(-(-frame.settings.spp // 8) * 8, MOST_SET_SIZE)
         query = field_query(frame.device, size, COSINE_SETS, frame.seed)
         query.mode, query.verify = _MODES[self.mode], self.verify
         return query
 
-    def _sky(self, frame: Any) -> Any:
+    def _sky(self, frame: Frame) -> Any:
         environment, sky = frame.scene.environment, trace_kernels.FieldSky()
         sky.set_size, sky.set_count = 1, 1
         if environment is None or environment.is_black:
@@ -206,7 +211,7 @@ class VisibilityField(Estimator):
             sky.radiance = wp.vec3(*environment.mean_radiance)
         else:
             sky.kind = trace_kernels.SKY_MAP
-            sky.set_size = min(-(-frame.pipeline.spp // 8) * 8, MOST_SET_SIZE)
+            sky.set_size = min(-(-frame.settings.spp // 8) * 8, MOST_SET_SIZE)
             sky.set_count = _set_count(sky.set_size)
             count = sky.set_size * sky.set_count
             sky.directions = wp.empty(count, dtype=wp.vec3, device=frame.device)
@@ -215,7 +220,7 @@ class VisibilityField(Estimator):
             frame.launch(trace_kernels.sample_sky, [frame.data, frame.seed, sky], count)
         return sky
 
-    def trace(self, frame: Any, state: FieldState) -> None:
+    def trace(self, frame: Frame, state: FieldState) -> None:
         """Add the light of the current camera sample, or of all of them when the pixels' transfers are known."""
         if _is_black(frame.scene):
             return
@@ -232,13 +237,13 @@ class VisibilityField(Estimator):
         inputs = [frame.data, frame.camera_data, frame.pass_settings, field, frame.hits, buffers]
         frame.launch_tiled(trace_kernels.trace_field, inputs)
 
-    def _relight_key(self, frame: Any, state: FieldState) -> tuple[Any, ...]:
+    def _relight_key(self, frame: Frame, state: FieldState) -> tuple[Any, ...]:
         poses = b"".join(pose.tobytes() for pose in state.poses or ())
         camera = frame.camera
         return camera.world_from_camera.tobytes(), camera.hfov, camera.resolution, poses, len(state.cells)
 
 
-def _is_black(scene: Any) -> bool:
+def _is_black(scene: Scene | BakedScene) -> bool:
     return scene.environment is None or scene.environment.is_black
 
 

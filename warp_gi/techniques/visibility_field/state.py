@@ -25,7 +25,7 @@ from warp_gi.errors import BakeError
 from warp_gi.kernels import gbuffer
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_bake as bake_kernels
-from warp_gi.scene.camera import Camera, CameraPath
+from warp_gi.scene.camera import Camera, CameraPath, camera_data
 from warp_gi.scene.scene import Scene
 from warp_gi.techniques.visibility_field.bake import FieldBaker, Grid, grid_of, grid_struct, words_of
 
@@ -271,8 +271,6 @@ class FieldState:
 
         It looks through those pixels of each block of 2 x 2 that ``corners`` name, 0 to 3.
         """
-        from warp_gi.scheduler import camera_data  # the scheduler imports the techniques
-
         width, height = (-(-size // 2) for size in camera.resolution)
         tiles = -(-width // gbuffer.TILE) * -(-height // gbuffer.TILE) * gbuffer.TILE**2
         place = grid_struct(self.grid, self.settings.resolution, None, None)

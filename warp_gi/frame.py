@@ -1,0 +1,227 @@
+"""A frame: one picture in the making, as estimators and kernels see it, then made."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+import warp as wp
+
+from warp_gi import launch
+from warp_gi.errors import unknown_name
+from warp_gi.kernels import denoise, gbuffer, types
+from warp_gi.paths import PathRequest, sky_probability
+from warp_gi.scene.camera import Camera, camera_data
+
+if TYPE_CHECKING:
+    from warp_gi.scene.baked import BakedScene
+    from warp_gi.scene.scene import Scene
+
+TERMS = ("environment", "emitters", "indirect")
+"""Terms of the light that estimators stand for; emission, the fourth, is always exact."""
+_VEC3_BUFFERS = ("beauty", "emission", *TERMS, "albedo", "normal", "position", "variance", "moment1", "moment2")
+BUFFERS = (
+    "beauty",
+    "emission",
+    *TERMS,
+    "albedo",
+    "normal",
+    "position",
+    "depth",
+    "motion",
+    "object_id",
+    "material_id",
+    "variance",
+)
+"""Names of a frame's buffers: radiance in W/(m^2 sr), lengths in m, motion in pixels, ids -1 for "nothing"."""
+
+Offer = TypeVar("Offer")
+
+
+@dataclass(frozen=True)
+class FrameSettings:
+    """Settings of a pipeline that decide how a frame is sampled."""
+
+    spp: int
+    """Samples a pixel."""
+    camera_samples: int
+    """Camera rays a pixel that the samples are spread over."""
+    filter: str = "box"
+    """Pixel filter, "box" or "tent"."""
+    wants_lobes: bool = False
+    """Whether a denoiser reads guides and the light of each lobe (``Frame.lobes``)."""
+
+
+class Frame:
+    """One picture in the making, then made: named buffers on a device.
+
+    ``frame["beauty"]`` is a wp.array of height * width items in rows from the top (vec3,
+    vec2, float32 or int32); ``frame.numpy("beauty")`` the same as an image.
+    """
+
+    def __init__(
+        self,
+        scene: Scene | BakedScene,
+        data: types.SceneData,
+        camera: Camera,
+        previous_camera: Camera,
+        settings: FrameSettings,
+        device: wp.Device,
+        index: int,
+        frame_time: float,
+        seed: int,
+        previous_index: int,
+    ) -> None:
+        self.scene, self.data, self.settings, self.device = scene, data, settings, device
+        self.camera, self.previous_camera = camera, previous_camera
+        self.index, self.previous_index = index, previous_index
+        self.time = frame_time
+        """Seconds from the first frame."""
+        self.seed = seed
+        """Hash of the sequence's seed and the frame's number."""
+        self.timings: dict[str, float] = {}
+        """Wall seconds by stage; "compile" is kernel compilation, left out of the others."""
+        self.metadata: dict[str, str | int | float] = {}
+        """What decides the pixels beside camera and time, by name."""
+        self.paths = PathRequest()
+        """What estimators ask of the path tracer."""
+        self.sky_probability = sky_probability(scene)
+        """Probability of sampling the sky where a path vertex samples either the sky or an emitter."""
+        self._offers: dict[type, Any] = {}
+        width, height = camera.resolution
+        count = width * height
+
+        def zeros(dtype: Any) -> wp.array:
+            return wp.zeros(count, dtype=dtype, device=device)
+
+        self._arrays: dict[str, wp.array] = {name: zeros(wp.vec3) for name in _VEC3_BUFFERS}
+        self._arrays |= {
+            "depth": zeros(wp.float32),
+            "motion": zeros(wp.vec2),
+            "object_id": zeros(wp.int32),
+            "material_id": zeros(wp.int32),
+        }
+        if settings.wants_lobes:
+            self._arrays |= {name: zeros(guide.type.dtype) for name, guide in denoise.Guides.vars.items()}
+        self.hits = gbuffer.PrimaryHits()
+        self.hits.direction = zeros(wp.vec3)
+        for name in ("t", "u", "v"):
+            setattr(self.hits, name, zeros(wp.float32))
+        self.hits.face = zeros(wp.int32)
+        self.camera_data, self.previous_camera_data = camera_data(camera), camera_data(previous_camera)
+        self.pass_settings = gbuffer.PassSettings()
+        """Seed, samples and filter of the current camera sample, as kernels read them."""
+
+    # ---- buffers ----
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the buffers: ``BUFFERS``, and with a denoiser "noisy", the beauty before it."""
+        return (*BUFFERS, "noisy") if "noisy" in self._arrays else BUFFERS
+
+    def __getitem__(self, name: str) -> wp.array:
+        """Return a buffer on the device, [height * width]; raises OptionError if there is none of that name."""
+        if name not in self.names:
+            raise unknown_name("frame buffer", name, self.names)
+        return self._arrays[name]
+
+    def numpy(self, name: str) -> np.ndarray:
+        """Return a buffer as an image, [height, width] or [height, width, channels], row 0 at the top."""
+        values = self[name].numpy()
+        width, height = self.camera.resolution
+        return values.reshape(height, width, *values.shape[1:])
+
+    def struct(self, struct: Any) -> Any:
+        """Return a kernel struct whose fields are the buffers of the same names."""
+        filled = struct()
+        for name in struct.vars:
+            setattr(filled, name, self._arrays.get(name))
+        return filled
+
+    def moments(self, name: str) -> tuple[wp.array, wp.array]:
+        """Return sums of an independent launch's samples and of their squares, which the variance buffer adds.
+
+        Both are vec3 [height * width]. ``name`` is the term that the samples are of; raises OptionError for others.
+        """
+        if name not in TERMS:
+            raise unknown_name("term", name, TERMS)
+        if self._arrays.get(f"{name}_moment1") is None:
+            for order in (1, 2):
+                self._arrays[f"{name}_moment{order}"] = wp.zeros_like(self._arrays[name])
+        return self._arrays[f"{name}_moment1"], self._arrays[f"{name}_moment2"]
+
+    def lobes(self) -> tuple[wp.array, wp.array] | None:
+        """Return sums over samples that an estimator of indirect light may add to, or None: then nobody reads them.
+
+        Both are vec3 [height * width]. The first is diffuse light as it comes in: times the diffuse albedo it is
+        the radiance that the diffuse lobe reflects. The second is the radiance that the glossy lobe reflects. What
+        is added here is part of the term's own buffer too; the denoiser takes it out of there.
+        """
+        if not self.settings.wants_lobes:
+            return None
+        for name in ("lobe_diffuse", "lobe_glossy"):
+            if name not in self._arrays:
+                self._arrays[name] = wp.zeros_like(self._arrays["indirect"])
+        return self._arrays["lobe_diffuse"], self._arrays["lobe_glossy"]
+
+    def keep_noisy(self) -> None:
+        """Make the composed beauty the buffer "noisy", and an empty beauty for a denoiser to fill."""
+        self._arrays["noisy"] = self._arrays["beauty"]
+        self._arrays["beauty"] = wp.empty_like(self._arrays["noisy"])
+
+    # ---- what services hand over ----
+
+    def offer(self, thing: object) -> None:
+        """Hand something over to the estimators of this frame; they find it by its class."""
+        self._offers[type(thing)] = thing
+
+    def offered(self, kind: type[Offer]) -> Offer | None:
+        """Return what a service offered of a class in this frame, or None."""
+        return self._offers.get(kind)
+
+    # ---- camera samples ----
+
+    def begin_view(self, view: int) -> None:
+        """Begin camera sample ``view``: 0 to ``settings.camera_samples`` - 1."""
+        spp, views, kernel = self.settings.spp, self.settings.camera_samples, self.pass_settings
+        kernel.seed = self.seed
+        kernel.camera_sample = view
+        kernel.camera_samples = views
+        kernel.camera_bits = (views - 1).bit_length()
+        kernel.first_sample = spp * view // views
+        kernel.sample_count = spp * (view + 1) // views - kernel.first_sample
+        kernel.sample_bits = (spp - 1).bit_length()
+        kernel.tent = int(self.settings.filter == "tent")
+        self.paths.begin()
+
+    # ---- launches ----
+
+    def launch(self, kernel: wp.Kernel, inputs: list[Any], count: int | None = None) -> None:
+        """Run a kernel over ``count`` items, or over every pixel."""
+        width, height = self.camera.resolution
+        launch.launch(kernel, width * height if count is None else count, inputs, self.device)
+
+    @property
+    def tiled_items(self) -> int:
+        """Items of a launch in tiles: those of pixels, and of what tiles at the border have besides."""
+        tiles = [math.ceil(size / gbuffer.TILE) for size in self.camera.resolution]
+        return tiles[0] * tiles[1] * gbuffer.TILE**2
+
+    def launch_tiled(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
+        """Run a kernel over every pixel in tiles (``kernels.gbuffer.tiled_pixel``)."""
+        self.launch(kernel, inputs, self.tiled_items)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the wall time of a block to ``timings[name]``, compilation apart."""
+        compiled, started = launch.compile_seconds, time.perf_counter()
+        yield
+        wp.synchronize_device(self.device)
+        compiled = launch.compile_seconds - compiled
+        self.timings["compile"] = self.timings.get("compile", 0.0) + compiled
+        self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - started - compiled

@@ -1,0 +1,139 @@
+"""What a frame asks of the path tracer: terms of the light, and how paths choose lights and directions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import warp as wp
+
+from warp_gi.kernels import path_samplers, path_trace
+
+if TYPE_CHECKING:
+    from warp_gi.frame import Frame
+    from warp_gi.scene.baked import BakedScene
+    from warp_gi.scene.scene import Scene
+
+TERM_BITS = {
+    "environment": int(path_trace.TERM_ENVIRONMENT),
+    "emitters": int(path_trace.TERM_EMITTERS),
+    "indirect": int(path_trace.TERM_INDIRECT),
+}
+
+
+class SamplerInUse(NamedTuple):
+    """A tuple of functions of ``kernels.path_samplers``, and the struct of data that they get in this frame."""
+
+    sampler: Any
+    data: Any
+
+
+class PathRequest:
+    """What the estimators of a frame ask of its paths, which they share.
+
+    Every path vertex samples lights and directions by what was asked for last. Without a request lights are sampled
+    in proportion to their power, and directions by the BSDF.
+    """
+
+    def __init__(self) -> None:
+        self.lights = SamplerInUse(path_samplers.ALIAS_LIGHTS, path_samplers.AliasLights())
+        self.directions = SamplerInUse(path_samplers.BSDF_DIRECTIONS, path_samplers.BsdfDirections())
+        self.regions = SamplerInUse(path_samplers.NO_REGIONS, path_samplers.NoRegions())
+        """Regions of space that samplers tell apart. Set by ``prepare``, if a sampler uses regions."""
+        self.table: wp.array | None = None
+        """Alias table over emitters, AliasBucket [emitter]; None is that of the scene, by power."""
+        self.terms = 0
+        """Bits of the terms that this camera sample's estimators want, ``path_trace.TERM_*``."""
+        self.max_depth = 2
+        self.roulette_depth = 5
+        self.clamp = 0.0
+        self._regions: tuple[Any, Callable[[PathRequest], Any]] | None = None
+
+    # ---- requests ----
+
+    def use_lights(self, sampler: path_samplers.LightSampler, data: Any, table: wp.array | None = None) -> None:
+        """Let vertices sample lights by ``sampler``.
+
+        ``data`` is its struct. ``table`` is an alias table over the emitters, for samplers that draw from one.
+        """
+        self.lights = SamplerInUse(sampler, data)
+        self.table = table
+
+    def use_directions(self, sampler: path_samplers.DirectionSampler, data: Any) -> None:
+        """Let paths go on in directions of ``sampler``; ``data`` is its struct."""
+        self.directions = SamplerInUse(sampler, data)
+
+    def use_regions(self, regions: path_samplers.Regions, data: Callable[[PathRequest], Any]) -> None:
+        """Let samplers find regions and leave samples in them.
+
+        ``data`` returns the struct of ``regions``. It is called before the first launch of a frame whose samplers use
+        regions, when all else is known.
+        """
+        self._regions = regions, data
+
+    def want(self, term: str, max_depth: int | None = None, roulette_depth: int = 5, clamp: float = 0.0) -> None:
+        """Ask for a term of the light in the current camera sample.
+
+        Args:
+            term: "environment", "emitters" or "indirect".
+            max_depth: Edges of the longest path; None leaves it to the other terms, or 2.
+            roulette_depth: Edges from which on paths end at random.
+            clamp: Largest component of a path's indirect radiance, W/(m^2 sr); 0 is no limit.
+        """
+        self.terms |= TERM_BITS[term]
+        if max_depth is not None:
+            self.max_depth, self.roulette_depth, self.clamp = max_depth, roulette_depth, clamp
+
+    # ---- launches ----
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether an estimator asked for a term in this camera sample."""
+        return self.terms != 0
+
+    def begin(self) -> None:
+        """Forget the terms of the last camera sample."""
+        self.terms = 0
+
+    def prepare(self) -> None:
+        """Make the regions, once a frame, if a sampler uses them."""
+        uses_regions = self.lights.sampler.uses_regions or self.directions.sampler.uses_regions
+        if uses_regions and self._regions is not None:
+            regions, data = self._regions
+            self.regions, self._regions = SamplerInUse(regions, data(self)), None
+
+    def launch(self, frame: Frame) -> None:
+        """Trace the terms that were asked for since the camera sample began, in one launch."""
+        self.prepare()
+        settings = path_trace.PathSettings()
+        settings.terms, settings.max_depth = self.terms, self.max_depth
+        settings.roulette_depth, settings.clamp = self.roulette_depth, self.clamp
+        settings.sky_probability = frame.sky_probability
+        settings.spp = frame.settings.spp
+        if self.table is not None:
+            frame.data.emitters.alias = self.table
+        elif frame.scene.emitter_count and self.lights.sampler is path_samplers.ALIAS_LIGHTS:
+            frame.data.emitters.alias = frame.scene.light_table(frame.device)
+        tracer = path_trace.path_tracer(self.lights.sampler, self.directions.sampler, self.regions.sampler)
+        samplers = tracer.samplers()
+        for name in ("lights", "directions", "regions"):
+            setattr(samplers, name, getattr(self, name).data)
+        buffers = frame.struct(path_trace.PathBuffers)
+        inputs = [frame.data, frame.camera_data, frame.pass_settings, settings, frame.hits, buffers, samplers]
+        frame.launch_tiled(tracer.trace_paths, inputs)
+
+
+def sky_probability(scene: Scene | BakedScene) -> float:
+    """Return how often a path vertex samples the sky rather than an emitter: by power, but neither under a fifth.
+
+    A sky sends pi radius^2 times its integral over the sphere into the scene; walls keep most of that out of a room.
+    """
+    environment = scene.environment
+    if environment is None or environment.pixels is None:
+        return 0.0
+    if scene.emitter_count == 0:
+        return 1.0
+    sky = 4.0 * math.pi**2 * scene.radius**2 * float(environment.mean_radiance @ (0.2126, 0.7152, 0.0722))
+    emitters = float(scene.emitter_powers().sum())
+    return min(max(sky / max(sky + emitters, 1e-30), 0.2), 0.8)

@@ -1,0 +1,36 @@
+"""Primaries: what finds the points that a frame shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from warp_gi.kernels import gbuffer
+from warp_gi.stateful import Stateful
+
+if TYPE_CHECKING:
+    from warp_gi.frame import Frame
+
+
+@dataclass(frozen=True)
+class Primary(Stateful):
+    """Base of what finds the points that a frame shows: fills ``Frame.hits`` and the surface buffers."""
+
+    is_whole: ClassVar[bool] = False
+    """Whether it fills the buffers of light, too. Then no estimator traces, and no path."""
+
+    def trace(self, frame: Frame, state: Any) -> None:
+        """Find the primary hits of the current camera sample, and fill the buffers of surfaces."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class CameraRays(Primary):
+    """Camera rays through the scene, jittered inside of each pixel."""
+
+    def trace(self, frame: Frame, state: Any) -> None:
+        """Trace the rays and shade what they hit."""
+        settings, cameras = frame.pass_settings, [frame.camera_data, frame.previous_camera_data]
+        frame.launch_tiled(gbuffer.trace_primary, [frame.data, frame.camera_data, settings, frame.hits])
+        buffers = frame.struct(gbuffer.SurfaceBuffers)
+        frame.launch(gbuffer.shade_primary, [frame.data, *cameras, settings, frame.hits, buffers])

@@ -1,0 +1,132 @@
+"""The registry: which techniques there are, by name. It imports none of their code.
+
+``warp_gi.techniques.TECHNIQUES`` lists folders. Each has a module ``technique`` with one ``Technique``, whose values
+are names and numbers.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+from warp_gi import techniques as folders
+from warp_gi.errors import unknown_name
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What an estimator claims of its pictures, which the truth tests check."""
+
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Settings under which the claim holds, where they are not the defaults."""
+    unbiased: bool = True
+    """Whether the mean over seeds is exact; a z-test checks it."""
+    bound: float = 0.0
+    """For a biased one: largest relative error of a picture's mean."""
+    resolution: tuple[Mapping[str, Any], ...] = ()
+    """For a biased one: settings from coarse to fine, along which the error falls."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Where a class of a technique lies, and what it claims."""
+
+    module: str
+    """Module that defines the class, below the technique's folder."""
+    claims: Mapping[str, Claim] = field(default_factory=lambda: {"": Claim()})
+    """Claims by variant; "" is that of the default settings."""
+
+
+@dataclass(frozen=True)
+class Technique:
+    """One technique, by names alone."""
+
+    name: str
+    """Long name, as in ``--technique``: "visibility-field"."""
+    short: str
+    """Short name: of its preset, its suite and the suffix of its bakes: "dvf"."""
+    estimators: Mapping[str, Entry] = field(default_factory=dict)
+    """Estimators by class name."""
+    services: Mapping[str, Entry] = field(default_factory=dict)
+    """Services by class name."""
+    functions: Mapping[str, str] = field(default_factory=dict)
+    """Public functions by name, with the module below the folder that defines them."""
+    presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Pipelines by name: fields where they differ from the default pipeline's.
+
+    The value of a term is the name of an estimator, a pair of that and its settings, or None.
+    """
+    samplers: tuple[str, ...] = ()
+    """Light samplers, direction samplers and radiance caches of path tracers: "module.NAME" below warp_gi.kernels."""
+    bake_tool: str = ""
+    """Module below the folder with ``TOOL``, by which ``warp-gi bake`` bakes it; "" if it has none."""
+    suite: str = ""
+    """Benchmark suite."""
+    page: str = ""
+    """Page of the documentation, below docs/."""
+
+
+@cache
+def techniques() -> dict[str, Technique]:
+    """Return all techniques by the names of their folders."""
+    return {
+        name: importlib.import_module(f"{folders.__name__}.{name}.technique").TECHNIQUE for name in folders.TECHNIQUES
+    }
+
+
+def folder_of(technique: Technique) -> str:
+    """Return the package of a technique."""
+    return next(f"{folders.__name__}.{name}" for name, one in techniques().items() if one is technique)
+
+
+def technique_named(name: str) -> Technique:
+    """Return the technique of a long or short name; raises OptionError for an unknown one."""
+    for one in techniques().values():
+        if name in (one.name, one.short):
+            return one
+    raise unknown_name("technique", name, [one.name for one in techniques().values()])
+
+
+def bake_tools() -> dict[str, str]:
+    """Return the modules of techniques that ``warp-gi bake`` can bake, by long name."""
+    return {one.name: f"{folder_of(one)}.{one.bake_tool}" for one in techniques().values() if one.bake_tool}
+
+
+def presets() -> dict[str, Mapping[str, Any]]:
+    """Return the fields of every named pipeline, where they differ from the default's."""
+    return {name: preset for one in techniques().values() for name, preset in one.presets.items()}
+
+
+def public() -> dict[str, str]:
+    """Return the modules of all classes and functions of techniques that users see, by name."""
+    found = {}
+    for one in techniques().values():
+        for name, entry in {**one.estimators, **one.services}.items():
+            found[name] = f"{folder_of(one)}.{entry.module}"
+        found |= {name: f"{folder_of(one)}.{module}" for name, module in one.functions.items()}
+    return found
+
+
+def find(name: str) -> Any:
+    """Return a class or function of a technique by name; raises KeyError for an unknown one."""
+    return getattr(importlib.import_module(public()[name]), name)
+
+
+def claims() -> Iterator[tuple[str, str, Claim]]:
+    """Yield class name, variant and claim of every estimator."""
+    for one in techniques().values():
+        for name, entry in one.estimators.items():
+            yield from ((name, variant, claim) for variant, claim in entry.claims.items())
+
+
+def samplers() -> dict[str, Any]:
+    """Return light samplers, direction samplers and radiance caches of every technique, by "module.NAME"."""
+    found = {}
+    for one in techniques().values():
+        for path in one.samplers:
+            module, _, name = path.rpartition(".")
+            found[path] = getattr(importlib.import_module(f"warp_gi.kernels.{module}"), name)
+    return found
