@@ -71,7 +71,7 @@ class SampleOctree(Service):
         cube.nodes = launch.on_device(np.array([255], np.uint32), wp.uint32, device)
         cube.low, cube.scale = wp.vec3(*corner), octree.SIDE / edge
         prefixes, levels = (wp.zeros(1, dtype=dtype, device=device) for dtype in (wp.uint32, wp.int32))
-        return OctreeState(cube, prefixes, levels, wp.zeros(8, dtype=wp.int32, device=device), SpareRecords())
+        return OctreeState(cube, prefixes, levels, wp.zeros(8, dtype=wp.int32, device=device))
 
     def preprocess(self, frame: Frame, state: OctreeState) -> OctreeState:
         """Let samplers find regions in the tree, and leave samples for ``after``."""
@@ -94,7 +94,7 @@ class SampleOctree(Service):
         records = frame.paths.regions.data.records
         lesson = self.learn(state, records, frame.device)
         frame.offer(lesson)
-        state.spare.give(records)
+        lesson.octree.spare.give(records)
         return lesson.octree
 
     def records(self, frame: Frame, vertices: int, previous: samples.SampleRecords | None) -> samples.SampleRecords:
@@ -128,7 +128,7 @@ class SampleOctree(Service):
         cube.nodes = tree.nodes
         grouped = samples.LeafSamples()
         grouped.starts, grouped.counts, grouped.order = tree.starts, counts, slots
-        grown = OctreeState(cube, tree.prefixes, tree.levels, tree.counts, state.spare)
+        grown = OctreeState(cube, tree.prefixes, tree.levels, tree.counts)
         return Lesson(grown, tree, records, grouped, neighbours, origins, device)
 
     def _build(self, state: OctreeState, codes: wp.array, device: wp.Device) -> tuple[octree.OctreeNodes, int]:
@@ -165,7 +165,8 @@ class SampleOctree(Service):
 class SpareRecords:
     """Buffers for samples that a frame is done with, for the next frame to use again.
 
-    A frame takes them away, so that one that is interrupted, whose last launches may still write there, leaves none.
+    A frame takes them from the state before, and leaves them in the state after. So a frame that is interrupted, whose
+    last launches may still write there, leaves none.
     """
 
     def __init__(self) -> None:
