@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_gi import launch
 from warp_gi.errors import unknown_name
-from warp_gi.kernels import denoise, gbuffer, types
+from warp_gi.kernels import denoise, gbuffer, path_samplers, path_trace, types
 from warp_gi.paths import PathRequest, sky_probability
 from warp_gi.scene.camera import Camera, camera_data
 
@@ -215,6 +215,26 @@ class Frame:
     def launch_tiled(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
         """Run a kernel over every pixel in tiles (``kernels.gbuffer.tiled_pixel``)."""
         self.launch(kernel, inputs, self.tiled_items)
+
+    def trace_paths(self) -> None:
+        """Trace the terms that estimators asked for in this camera sample, in one launch (``PathRequest``)."""
+        request = self.paths
+        request.prepare()
+        settings = path_trace.PathSettings()
+        settings.terms, settings.max_depth = request.terms, request.max_depth
+        settings.roulette_depth, settings.clamp = request.roulette_depth, request.clamp
+        settings.sky_probability, settings.spp = self.sky_probability, self.settings.spp
+        if request.table is not None:
+            self.data.emitters.alias = request.table
+        elif self.scene.emitter_count and request.lights.sampler is path_samplers.ALIAS_LIGHTS:
+            self.data.emitters.alias = self.scene.light_table(self.device)
+        tracer = path_trace.path_tracer(*request.samplers())
+        samplers = tracer.samplers()
+        for name in tracer.samplers.vars:
+            setattr(samplers, name, getattr(request, name).data)
+        buffers = self.struct(path_trace.PathBuffers)
+        inputs = [self.data, self.camera_data, self.pass_settings, settings, self.hits, buffers, samplers]
+        self.launch_tiled(tracer.trace_paths, inputs)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

@@ -11,7 +11,6 @@ import warp as wp
 from warp_gi.kernels import path_samplers, path_trace
 
 if TYPE_CHECKING:
-    from warp_gi.frame import Frame
     from warp_gi.scene.baked import BakedScene
     from warp_gi.scene.scene import Scene
 
@@ -85,12 +84,16 @@ class PathRequest:
         if max_depth is not None:
             self.max_depth, self.roulette_depth, self.clamp = max_depth, roulette_depth, clamp
 
-    # ---- launches ----
+    # ---- what the frame does with them ----
 
     @property
     def is_wanted(self) -> bool:
         """Whether an estimator asked for a term in this camera sample."""
         return self.terms != 0
+
+    def samplers(self) -> tuple[Any, ...]:
+        """Return the arguments of ``kernels.path_trace.path_tracer``."""
+        return self.lights.sampler, self.directions.sampler, self.regions.sampler
 
     def begin(self) -> None:
         """Forget the terms of the last camera sample."""
@@ -102,26 +105,6 @@ class PathRequest:
         if uses_regions and self._regions is not None:
             regions, data = self._regions
             self.regions, self._regions = SamplerInUse(regions, data(self)), None
-
-    def launch(self, frame: Frame) -> None:
-        """Trace the terms that were asked for since the camera sample began, in one launch."""
-        self.prepare()
-        settings = path_trace.PathSettings()
-        settings.terms, settings.max_depth = self.terms, self.max_depth
-        settings.roulette_depth, settings.clamp = self.roulette_depth, self.clamp
-        settings.sky_probability = frame.sky_probability
-        settings.spp = frame.settings.spp
-        if self.table is not None:
-            frame.data.emitters.alias = self.table
-        elif frame.scene.emitter_count and self.lights.sampler is path_samplers.ALIAS_LIGHTS:
-            frame.data.emitters.alias = frame.scene.light_table(frame.device)
-        tracer = path_trace.path_tracer(self.lights.sampler, self.directions.sampler, self.regions.sampler)
-        samplers = tracer.samplers()
-        for name in ("lights", "directions", "regions"):
-            setattr(samplers, name, getattr(self, name).data)
-        buffers = frame.struct(path_trace.PathBuffers)
-        inputs = [frame.data, frame.camera_data, frame.pass_settings, settings, frame.hits, buffers, samplers]
-        frame.launch_tiled(tracer.trace_paths, inputs)
 
 
 def sky_probability(scene: Scene | BakedScene) -> float:

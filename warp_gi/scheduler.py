@@ -224,7 +224,7 @@ class FrameScheduler:
                 estimator.trace(frame, states[term])
         frame.paths.prepare()
         with frame.stage("paths"):
-            frame.paths.launch(frame)
+            frame.trace_paths()
 
     def _camera_at(self, index: int) -> Camera:
         return self.camera.camera(index) if isinstance(self.camera, CameraPath) else self.camera

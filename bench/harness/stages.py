@@ -82,7 +82,7 @@ class Stage:
         """Do the stage once more; its sums are no picture any more."""
         self.estimator.trace(self.frame, self.state)
         if self.frame.paths.is_wanted:
-            self.frame.paths.launch(self.frame)
+            self.frame.trace_paths()
         wp.synchronize_device(self.frame.device)
 
 
