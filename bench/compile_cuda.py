@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import itertools
 import multiprocessing
 import pkgutil
 import tempfile
@@ -17,9 +18,27 @@ import warp as wp
 
 import warp_gi.kernels
 from warp_gi import launch
-from warp_gi.kernels.path_tracers import every_tracer
+from warp_gi.kernels.guided_directions import GUIDED_DIRECTIONS
+from warp_gi.kernels.light_cache import CACHED_LIGHTS
+from warp_gi.kernels.light_field_cache import PROBE_CACHE
+from warp_gi.kernels.light_hierarchy import HIERARCHY_LIGHTS
+from warp_gi.kernels.path_samplers import ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_CACHE, NO_REGIONS, SCENE_SKY
+from warp_gi.kernels.path_trace import PathTracer, path_tracer
+from warp_gi.kernels.samples import SAMPLE_REGIONS
 
 ARCHITECTURES = (80, 90)
+LIGHTS = (ALIAS_LIGHTS, HIERARCHY_LIGHTS, CACHED_LIGHTS)
+DIRECTIONS = (BSDF_DIRECTIONS, GUIDED_DIRECTIONS)
+CACHES = (NO_CACHE, PROBE_CACHE)
+
+
+def every_tracer() -> list[PathTracer]:
+    """Return the path tracers of all samplers and caches; each is a Warp module of its own."""
+    return [
+        path_tracer(lights, directions, regions, SCENE_SKY, cache)
+        for lights, directions, cache in itertools.product(LIGHTS, DIRECTIONS, CACHES)
+        for regions in [SAMPLE_REGIONS if lights.uses_regions or directions.uses_regions else NO_REGIONS]
+    ]
 
 
 def kernel_modules() -> list[str]:

@@ -317,7 +317,7 @@ def cached_light_pdf(
     return pdf
 
 
-CACHED_LIGHTS = LightSampler("cache", LightCache, cached_light, cached_light_pdf, another_light)
+CACHED_LIGHTS = LightSampler("cache", LightCache, cached_light, cached_light_pdf, another_light, uses_regions=True)
 
 
 # Thread: an emissive triangle. Its shape as it is now.

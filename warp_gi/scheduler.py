@@ -20,7 +20,7 @@ from warp_gi import launch
 from warp_gi.baking import Bake, load_bake
 from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.estimator import Ahead, Estimator, SamplerInUse
-from warp_gi.kernels import compose, denoise, gbuffer, path_samplers, path_trace, path_tracers, samples, types
+from warp_gi.kernels import compose, denoise, gbuffer, path_samplers, path_trace, samples, types
 from warp_gi.pipeline import TERMS, Pipeline
 from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.camera import Camera, CameraPath
@@ -145,7 +145,7 @@ class Frame:
         paths.clamp = self._paths.clamp
         paths.sky_probability = self._sky_probability
         paths.spp = self.pipeline.spp
-        tracer = path_tracers.tracer(self.lights.sampler, self.directions.sampler)
+        tracer = path_trace.path_tracer(self.lights.sampler, self.directions.sampler, self.regions.sampler)
         samplers = tracer.samplers()
         for name in ("lights", "directions", "regions"):
             setattr(samplers, name, getattr(self, name).data)
@@ -365,7 +365,7 @@ class FrameScheduler:
                 states[term] = estimator.preprocess(frame, states[term])
         if self._light_sampler is not None:
             states["lights"] = self._light_sampler.preprocess(frame, states.get("lights"))
-        learns = path_tracers.learns(frame.lights.sampler, frame.directions.sampler)  # not so without any lights
+        learns = frame.lights.sampler.uses_regions or frame.directions.sampler.uses_regions  # not so without any lights
         if learns:
             with frame.stage("preprocess octree"):
                 records = self._open_records(frame, states["octree"], records)

@@ -15,6 +15,7 @@ from warp_gi.baking import Bake
 from warp_gi.errors import BakeError, OptionError, check_whole, unknown_name
 from warp_gi.estimator import Ahead, Estimator
 from warp_gi.kernels import light_field as field_kernels
+from warp_gi.kernels import light_field_cache
 from warp_gi.kernels import light_field_trace as trace_kernels
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.techniques.light_field.places import MOST_PROBES, camera_rows, cameras_of, map_resolution
@@ -26,7 +27,7 @@ _MODES = {
     "traced": trace_kernels.MODE_TRACED,
 }
 _THROUGH = {"geometry": trace_kernels.RAYS_GEOMETRY, "probes": trace_kernels.RAYS_PROBES}
-VISIBILITIES = {"probes": trace_kernels.VISIBILITY_PROBES, "exact": trace_kernels.VISIBILITY_EXACT}
+VISIBILITIES = {"probes": light_field_cache.VISIBILITY_PROBES, "exact": light_field_cache.VISIBILITY_EXACT}
 _PRIMARIES = ("geometry", "probes")
 _WEIGHTS = ("visibility", "trilinear")
 MOST_RESOLUTION = 1024
