@@ -17,7 +17,15 @@ import warp as wp
 
 import warp_gi.kernels
 from warp_gi import launch, registry
-from warp_gi.kernels.path_samplers import NO_REGIONS, DirectionSampler, LightSampler
+from warp_gi.kernels.path_samplers import (
+    ALIAS_LIGHTS,
+    BSDF_DIRECTIONS,
+    NO_REGIONS,
+    SCENE_SKY,
+    DirectionSampler,
+    LightSampler,
+    PathCache,
+)
 from warp_gi.kernels.path_trace import PathTracer, path_tracer
 from warp_gi.kernels.samples import SAMPLE_REGIONS
 
@@ -32,15 +40,17 @@ def kernel_modules() -> list[str]:
 
 
 def every_tracer() -> list[PathTracer]:
-    """Return the path tracer of each light sampler with each direction sampler of the registry."""
+    """Return the path tracers of the registry: each light sampler with each direction sampler, and each cache once."""
     found = registry.samplers().values()
     lights = [one for one in found if isinstance(one, LightSampler)]
     directions = [one for one in found if isinstance(one, DirectionSampler)]
-    return [
-        path_tracer(light, direction, SAMPLE_REGIONS if light.uses_regions or direction.uses_regions else NO_REGIONS)
-        for light in lights
-        for direction in directions
+    pairs = [(light, direction) for light in lights for direction in directions]
+    regions = [
+        SAMPLE_REGIONS if light.uses_regions or direction.uses_regions else NO_REGIONS for light, direction in pairs
     ]
+    plain = [path_tracer(*pair, region) for pair, region in zip(pairs, regions, strict=True)]
+    caches = [one for one in found if isinstance(one, PathCache)]
+    return plain + [path_tracer(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY, cache) for cache in caches]
 
 
 def compile_module(name: str, architectures: Sequence[int], folder: Path) -> list[Path]:

@@ -5,7 +5,7 @@ import warp as wp
 from warp_gi.kernels.bsdf import average_specular
 from warp_gi.kernels.bvh import bvh_intersect
 from warp_gi.kernels.environment import environment_radiance
-from warp_gi.kernels.sampling import filter_offset, pixel_sample_index, pixel_seed, sample_2d
+from warp_gi.kernels.sampling import CAMERA_DIMENSION, filter_offset, pixel_sample_index, pixel_seed, sample_2d
 from warp_gi.kernels.surface import Surface, shading_normal, surface_at, surface_emission
 from warp_gi.kernels.types import Geometry, SceneData
 
@@ -104,7 +104,7 @@ def primary_direction(camera: CameraData, settings: PassSettings, p: wp.vec2i) -
     if settings.camera_samples > 1:
         index = pixel_sample_index(p[0], p[1], settings.camera_sample, settings.camera_bits)
         seed = pixel_seed(p[0], p[1], settings.camera_bits, settings.seed)
-        u = sample_2d(index, seed, 0)
+        u = sample_2d(index, seed, CAMERA_DIMENSION)
         offset = wp.vec2(filter_offset(settings.tent, u[0]), filter_offset(settings.tent, u[1]))
     return camera_ray(camera, wp.float32(p[0]) + 0.5 + offset[0], wp.float32(p[1]) + 0.5 + offset[1])
 

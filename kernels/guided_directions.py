@@ -11,7 +11,7 @@ from warp_gi.kernels.parallax import seen_from_anchor, seen_from_point
 from warp_gi.kernels.path_samplers import DirectionSample, DirectionSampler
 from warp_gi.kernels.quadtree import quadtree_pdf, quadtree_sample_leaf, quadtree_sample_warp
 from warp_gi.kernels.samples import is_glossy
-from warp_gi.kernels.sampling import random_1d, sample_1d, sample_2d
+from warp_gi.kernels.sampling import GUIDE_DIMENSIONS, random_1d, sample_1d, sample_2d
 from warp_gi.kernels.surface import Surface
 
 wp.set_module_options({"enable_backward": False})
@@ -73,7 +73,7 @@ def guided_direction(
             tree_direction = q.direction
             guide_pdf = q.pdf
         else:
-            u_leaf = random_1d(index, seed, dimension + 8192)
+            u_leaf = random_1d(index, seed, dimension + GUIDE_DIMENSIONS)
             q = quadtree_sample_leaf(data.trees[region], data.bits, u_leaf, u2)
             tree_direction = q.direction
             guide_pdf = q.pdf

@@ -29,6 +29,7 @@ from warp_gi.kernels.light_field import (
 from warp_gi.kernels.light_field_place import PROBE_FACTOR, sees_back
 from warp_gi.kernels.octahedral import octahedral_decode, octahedral_wrap
 from warp_gi.kernels.path_trace import (
+    NO_PATH,
     TERM_EMITTERS,
     TERM_ENVIRONMENT,
     TERM_INDIRECT,
@@ -36,7 +37,7 @@ from warp_gi.kernels.path_trace import (
     PathSettings,
     trace_path,
 )
-from warp_gi.kernels.sampling import hash_uint, morton_code, sample_2d
+from warp_gi.kernels.sampling import CAMERA_DIMENSION, hash_uint, morton_code, sample_2d
 from warp_gi.kernels.surface import shading_normal, surface_emission, surface_shape, with_color
 from warp_gi.kernels.types import SceneData
 
@@ -46,7 +47,6 @@ LOBE = wp.constant(wp.float32(50.0))  # power of the cosine that distances are f
 LOBE_END = wp.constant(wp.float32(0.85))  # cosine below which its power, 3e-4, counts as 0
 SAME_DISTANCE = wp.constant(wp.float32(0.1))  # surfels that differ by less share their irradiance
 SAME_NORMAL = wp.constant(wp.float32(0.9))
-JITTER_DIMENSION = wp.constant(0)
 TEXEL_BACK = wp.constant(wp.uint8(1))  # sees the back of a triangle
 TEXEL_SAME = wp.constant(wp.uint8(2))  # sees the surfel that it saw before
 
@@ -119,7 +119,7 @@ def sample_texel(
         paths.terms = TERM_ENVIRONMENT | TERM_EMITTERS | TERM_INDIRECT
         paths.max_depth = work.max_depth
         r.albedo = wp.vec3(0.0, 0.0, 0.0)
-    light = trace_path(scene, PathSamplers(), hit, s, -direction, paths, index, seed, -1)
+    light = trace_path(scene, PathSamplers(), hit, s, -direction, paths, index, seed, NO_PATH)
     r.direct = light.environment + light.emitters + light.indirect
     return r
 
@@ -146,7 +146,7 @@ def trace_texels(first: wp.int32, scene: SceneData, field: LightField, work: Pro
     for ray in range(work.rays):
         offset = wp.vec2(0.5, 0.5)
         if ray > 0:
-            offset = sample_2d(index + wp.uint32(ray), seed, JITTER_DIMENSION)
+            offset = sample_2d(index + wp.uint32(ray), seed, CAMERA_DIMENSION)
         uv = wp.vec2(wp.float32(column) + offset[0], wp.float32(row) + offset[1]) / wp.float32(field.resolution)
         direction = octahedral_decode(uv)
         s = sample_texel(scene, field, work, origin, direction, index + wp.uint32(ray), seed)

@@ -8,6 +8,7 @@ from warp_gi.kernels.environment import environment_radiance
 from warp_gi.kernels.gbuffer import CameraData, camera_ray
 from warp_gi.kernels.light_field import LightField
 from warp_gi.kernels.path_trace import (
+    NO_PATH,
     TERM_EMITTERS,
     TERM_ENVIRONMENT,
     TERM_INDIRECT,
@@ -15,7 +16,14 @@ from warp_gi.kernels.path_trace import (
     PathSettings,
     trace_path,
 )
-from warp_gi.kernels.sampling import hash_uint, sample_1d, sample_2d
+from warp_gi.kernels.sampling import (
+    CAMERA_DIMENSION,
+    REACH_DIMENSION,
+    REACH_VERTEX_DIMENSIONS,
+    hash_uint,
+    sample_1d,
+    sample_2d,
+)
 from warp_gi.kernels.surface import ray_origin, surface_at, surface_emission
 from warp_gi.kernels.types import SceneData
 
@@ -25,7 +33,6 @@ PLACE_STEPS = wp.constant(6)
 PLACE_BACK = wp.constant(wp.float32(0.25))  # share of back faces from which a probe looks for a way out
 LIGHT_DEPTH = wp.constant(6)  # edges of the longest path that says where light is
 REACH_VERTICES = wp.constant(3)  # of a path that says what a camera's light goes over: the first hit and two more
-REACH_DIMENSIONS = wp.constant(3)
 PROBE_FACTOR = wp.constant(wp.uint32(2654435769))
 
 
@@ -107,7 +114,7 @@ def measure_light(
     s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
     seed = hash_uint(wp.uint32(point) * PROBE_FACTOR)
     index = wp.uint32(i - point * directions)
-    path = trace_path(scene, PathSamplers(), hit, s, -direction, paths, index, seed, -1)
+    path = trace_path(scene, PathSamplers(), hit, s, -direction, paths, index, seed, NO_PATH)
     total = path.environment + path.emitters + path.indirect
     total = total + surface_emission(scene, hit.face, hit.u, hit.v, -direction)
     light[i] = (total[0] + total[1] + total[2]) / 3.0
@@ -126,7 +133,7 @@ def follow_paths(
 ):
     path = first + wp.tid()
     index = wp.uint32(path)
-    u = sample_2d(index, seed, 0)
+    u = sample_2d(index, seed, CAMERA_DIMENSION)
     origin = camera.position
     direction = camera_ray(camera, u[0] * wp.float32(camera.width), u[1] * wp.float32(camera.height))
     vertices = int(REACH_VERTICES)
@@ -137,7 +144,7 @@ def follow_paths(
         s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
         points[path * vertices + k] = s.position
         found[path * vertices + k] = wp.uint8(1)
-        d = 1 + k * REACH_DIMENSIONS
+        d = REACH_DIMENSION + k * REACH_VERTEX_DIMENSIONS
         wo = wp.transpose(s.shading) * -direction
         b = bsdf_sample(s.bsdf, wo, sample_1d(index, seed, d), sample_2d(index, seed, d + 1))
         direction = s.shading * b.wi

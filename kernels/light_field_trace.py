@@ -10,34 +10,28 @@ import warp as wp
 
 from warp_gi.kernels.bsdf import (
     BsdfSample,
-    average_reflectance,
     average_specular,
     bsdf_sample,
     diffuse_share,
     fresnel,
     specular_sample,
 )
-from warp_gi.kernels.bvh import BvhHit, bvh_intersect, bvh_occluded
+from warp_gi.kernels.bvh import BvhHit, bvh_intersect
 from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, primary_direction, tiled_pixel
 from warp_gi.kernels.light_field import (
     NOTHING,
     PROBE_USABLE,
     LightField,
-    blend_weight,
-    cage_of,
-    cage_probe,
-    grid_position,
-    is_outside,
-    map_visibility,
-    probe_irradiance,
     surfel_distance,
     surfel_normal,
     texel_emission,
     unpack_radiance,
 )
+from warp_gi.kernels.light_field_cache import SeenLight, cached_radiance, seen_light
 from warp_gi.kernels.light_field_march import MISS, march
 from warp_gi.kernels.octahedral import octahedral_encode, octahedral_texel
 from warp_gi.kernels.path_trace import (
+    NO_PATH,
     TERM_EMITTERS,
     TERM_ENVIRONMENT,
     TERM_INDIRECT,
@@ -45,7 +39,17 @@ from warp_gi.kernels.path_trace import (
     PathSettings,
     trace_path,
 )
-from warp_gi.kernels.sampling import pixel_sample_index, pixel_seed, random_1d, sample_1d, sample_2d
+from warp_gi.kernels.sampling import (
+    PROBE_HIT_DIMENSION,
+    PROBE_LOBE_DIMENSION,
+    PROBE_PIXEL_DIMENSION,
+    PROBE_RAY_DIMENSION,
+    pixel_sample_index,
+    pixel_seed,
+    random_1d,
+    sample_1d,
+    sample_2d,
+)
 from warp_gi.kernels.surface import Surface, ray_origin, shading_normal, surface_at
 from warp_gi.kernels.types import SceneData
 
@@ -57,13 +61,6 @@ MODE_TRACED = wp.constant(2)
 MOST_STEPS = wp.constant(1 << 20)
 RAYS_GEOMETRY = wp.constant(0)
 RAYS_PROBES = wp.constant(1)
-VISIBILITY_PROBES = wp.constant(0)
-VISIBILITY_EXACT = wp.constant(1)
-IN_SIGHT = wp.constant(wp.float32(0.3))  # by the maps, whose bounds are kind to what is hidden
-LOBE_DIMENSION = wp.constant(2000)  # dimension pairs that no path gets to
-DIRECTION_DIMENSION = wp.constant(2001)
-PIXEL_DIMENSION = wp.constant(2002)
-HIT_DIMENSION = wp.constant(2003)
 
 
 @wp.struct
@@ -104,50 +101,6 @@ class ProbeView:
     moment2: wp.array(dtype=wp.vec3)
 
 
-# What probes say of the light at a point.
-@wp.struct
-class SeenLight:
-    irradiance: wp.vec3  # W/m^2, by reflected light; 0 where nothing is known
-    probes: wp.int32  # in front of the surface that see the point
-    trust: wp.float32  # 1 where enough of them do, 0 where none does
-
-
-# The irradiance between the probes that see a point with a unit normal, by their maps or by shadow rays.
-@wp.func
-def seen_light(
-    scene: SceneData, field: LightField, visibility: wp.int32, position: wp.vec3, normal: wp.vec3, origin: wp.vec3
-) -> SeenLight:
-    r = SeenLight()
-    at = grid_position(field, position)
-    if is_outside(field, at):
-        return r
-    cage = cage_of(field, at)
-    uv = octahedral_encode(normal)
-    weights = float(0.0)
-    around = float(0.0)
-    corners = int(8)
-    for corner in range(corners):
-        probe = cage_probe(field, cage, corner)
-        weight = blend_weight(field, cage, corner, at, position, normal)
-        around += weight
-        sight = float(0.0)
-        if weight > 0.0:
-            if visibility == VISIBILITY_PROBES:
-                sight = map_visibility(field, probe, position, normal)
-            elif not bvh_occluded(scene.bvh, origin, field.positions[probe] - origin, 1.0):
-                sight = 1.0
-        if sight > 0.0:
-            r.irradiance = r.irradiance + probe_irradiance(field, probe, uv) * (weight * sight)
-            weights = weights + weight * sight
-        if sight >= IN_SIGHT and wp.dot(field.positions[probe] - position, normal) > 0.0:
-            r.probes += 1
-    if weights <= 0.0:
-        return r
-    r.irradiance = r.irradiance / weights
-    r.trust = wp.min(weights / (around * field.least_seen), 1.0)
-    return r
-
-
 # What surfaces reflect towards `origin` from a direction, as far as the maps of the probes know.
 @wp.func
 def reflected_radiance(field: LightField, origin: wp.vec3, direction: wp.vec3) -> wp.vec3:
@@ -181,12 +134,12 @@ def steady_light(irradiance: wp.vec3, s: Surface, mode: wp.int32) -> Lobes:
 # Direction of a ray, by the glossy lobe alone or by the whole BSDF.
 @wp.func
 def ray_direction(s: Surface, wo: wp.vec3, mode: wp.int32, index: wp.uint32, seed: wp.uint32) -> BsdfSample:
-    u = sample_2d(index, seed, DIRECTION_DIMENSION)
+    u = sample_2d(index, seed, PROBE_RAY_DIMENSION)
     if mode == MODE_HYBRID:
         return specular_sample(s.bsdf, wo, u)
     u_lobe = float(0.0)
     if s.bsdf.f90 > 0.0:
-        u_lobe = sample_1d(index, seed, LOBE_DIMENSION)
+        u_lobe = sample_1d(index, seed, PROBE_LOBE_DIMENSION)
     return bsdf_sample(s.bsdf, wo, u_lobe, u)
 
 
@@ -231,11 +184,11 @@ def reflected_light(
     paths = query.paths
     paths.terms = TERM_ENVIRONMENT | TERM_EMITTERS
     known = wp.vec3(0.0, 0.0, 0.0)
-    if trusts(seen, index, seed, HIT_DIMENSION):
-        known = wp.cw_mul(average_reflectance(s.bsdf), seen.irradiance) / wp.pi
+    if trusts(seen, index, seed, PROBE_HIT_DIMENSION):
+        known = cached_radiance(s, seen)
     else:
         paths.terms = TERM_ENVIRONMENT | TERM_EMITTERS | TERM_INDIRECT
-    light = trace_path(scene, PathSamplers(), hit, s, towards, paths, index, seed, -1)
+    light = trace_path(scene, PathSamplers(), hit, s, towards, paths, index, seed, NO_PATH)
     return known + light.environment + light.emitters + light.indirect
 
 
@@ -282,7 +235,7 @@ def sample_light(
     light = Lobes()
     mode = query.mode
     through = query.through
-    trusted = trusts(seen, index, seed, PIXEL_DIMENSION)
+    trusted = trusts(seen, index, seed, PROBE_PIXEL_DIMENSION)
     if trusted:
         light = steady_light(seen.irradiance, s, mode)
     else:

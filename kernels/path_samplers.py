@@ -1,8 +1,9 @@
-"""What a path asks at every vertex: which light to sample, which way to go on. And what it leaves behind for others.
+"""What a path asks at every vertex: which light to sample, which way to go on, what is known of the light there.
 
-A path kernel is made for one light sampler, one direction sampler and one set of regions (``path_trace.path_tracer``).
-Each is a tuple of Warp functions, and a struct of the data that they get. The baselines stand here: lights by an alias
-table, directions by the BSDF, no regions.
+And what it meets beyond the scene, and what it leaves behind for others. A path kernel is made for one light sampler,
+one direction sampler, one set of regions, one sky and one radiance cache (``path_trace.path_tracer``). Each is a tuple
+of Warp functions, and a struct of the data that they get. The baselines stand here: lights by an alias table,
+directions by the BSDF, no regions, the scene's sky, no cache.
 """
 
 from typing import Any, NamedTuple
@@ -11,10 +12,18 @@ import warp as wp
 
 from warp_gi.kernels.alias import alias_choice
 from warp_gi.kernels.bsdf import Bsdf, bsdf_sample
+from warp_gi.kernels.bvh import BvhHit
 from warp_gi.kernels.emitters import LightChoice
+from warp_gi.kernels.environment import (
+    EnvironmentLookup,
+    EnvironmentSample,
+    environment_lookup,
+    environment_prefetch,
+    environment_sample,
+)
 from warp_gi.kernels.sampling import sample_1d, sample_2d
 from warp_gi.kernels.surface import Surface
-from warp_gi.kernels.types import SceneData
+from warp_gi.kernels.types import ENVIRONMENT_MAP, ENVIRONMENT_NONE, SceneData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -53,6 +62,56 @@ class Regions(NamedTuple):
     # (data, slot, sample, one over the distance to what it hits, throughput up to the vertex, light of the path so far)
     direction: wp.Function
     end: wp.Function  # (data, slot, vertices, light of the path)
+
+
+class Sky(NamedTuple):
+    """What a path meets where it leaves the scene: radiance, or someone who records that it came.
+
+    `leave` is called for every way out that counts, with the weight that radiance from there has in the picture: the
+    picture is the sum of weight times radiance. It is a product of f cos / pdf over the vertices, of the weight of
+    multiple importance sampling, and of what roulette has made of it; radiance is not in it. So a sky that returns
+    black and records sums of weight times y_j(direction) records the transfer of each y_j: relit later by any radiance
+    sum_j L_j y_j, it gives sum_j L_j times them. Clamping knows nothing of such records.
+
+    One thread at a time follows the paths of one item, in order, so `leave` may add to arrays at a place that follows
+    from the path's number, without atomics. In ``trace_paths`` path = item * PathSettings.spp + sample, item being
+    that of ``gbuffer.tiled_pixel``; whoever calls ``trace_path`` numbers paths as it likes, NO_PATH records nothing.
+    Light that a camera ray sees of the sky is no path's, and not recorded. A recorder that has no use for emitters
+    takes them out of its SceneData (count = 0), or paths sample them in vain.
+    """
+
+    name: str
+    data: Any  # struct
+    is_lit: wp.Function  # (data, scene) -> bool: whether light comes from there, or whoever leaves counts
+    # (data, scene) -> bool: whether vertices sample it, too. If not, as of a constant sky, only directions that leave
+    # count, with all of their weight.
+    is_sampled: wp.Function
+    prefetch: wp.Function  # (data, scene, u: vec3): called ahead of `sample` with the same numbers
+    sample: wp.Function  # (data, scene, u: vec3) -> EnvironmentSample
+    lookup: wp.Function  # (data, scene, direction) -> EnvironmentLookup, whose pdf is that of `sample`
+    # (data, path: int64, edges of the path from the camera to the sky: 2 is direct light, direction, weight: vec3)
+    leave: wp.Function
+
+
+class PathCache(NamedTuple):
+    """What is known of the light at a vertex, so that a path may end there: a radiance cache.
+
+    `lookup` returns what the surface reflects towards `wo` of all light that the vertex's own light and direction
+    samples do not hold: of light that was reflected or scattered before, from everywhere. Direct light of emitters and
+    of the sky is sampled there as without a cache.
+    """
+
+    name: str
+    data: Any  # struct
+    # (data, scene, surface with its colour, wo in the frame of shading, BvhHit) -> KnownRadiance
+    lookup: wp.Function
+
+
+# What a radiance cache says of a vertex.
+@wp.struct
+class KnownRadiance:
+    radiance: wp.vec3  # W/(m^2 sr), reflected towards wo
+    validity: wp.float32  # share of paths that end here, in [0, 1]; 0: nothing is known, 1: all of them end
 
 
 # A direction with its density; `weight` is f cos / pdf but for the colour of a Lambert surface, see sample_weight.
@@ -191,8 +250,65 @@ def keep_no_end(data: NoRegions, slot: wp.int32, vertices: wp.int32, light: wp.f
     pass
 
 
+@wp.struct
+class SceneSky:
+    unused: wp.int32  # the sky is SceneData.environment
+
+
+@wp.func
+def scene_sky_is_lit(data: SceneSky, scene: SceneData) -> wp.bool:
+    return scene.environment.kind != ENVIRONMENT_NONE
+
+
+@wp.func
+def scene_sky_is_sampled(data: SceneSky, scene: SceneData) -> wp.bool:
+    return scene.environment.kind == ENVIRONMENT_MAP
+
+
+@wp.func
+def scene_sky_prefetch(data: SceneSky, scene: SceneData, u: wp.vec3):
+    environment_prefetch(scene.environment, u)
+
+
+@wp.func
+def scene_sky_sample(data: SceneSky, scene: SceneData, u: wp.vec3) -> EnvironmentSample:
+    return environment_sample(scene.environment, u)
+
+
+@wp.func
+def scene_sky_lookup(data: SceneSky, scene: SceneData, direction: wp.vec3) -> EnvironmentLookup:
+    return environment_lookup(scene.environment, direction)
+
+
+# For skies that keep no record.
+@wp.func
+def leave_no_record(data: Any, path: wp.int64, edges: wp.int32, direction: wp.vec3, weight: wp.vec3):
+    pass
+
+
+@wp.struct
+class NoCache:
+    unused: wp.int32
+
+
+@wp.func
+def nothing_known(data: NoCache, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit) -> KnownRadiance:
+    return KnownRadiance()
+
+
 ALIAS_LIGHTS = LightSampler("alias", AliasLights, alias_light, alias_light_pdf)
 BSDF_DIRECTIONS = DirectionSampler("bsdf", BsdfDirections, bsdf_direction, bsdf_direction_pdf)
 NO_REGIONS = Regions(
     "none", NoRegions, no_region, no_slot, no_vertex, keep_no_vertex, keep_no_light, keep_no_direction, keep_no_end
 )
+SCENE_SKY = Sky(
+    "scene",
+    SceneSky,
+    scene_sky_is_lit,
+    scene_sky_is_sampled,
+    scene_sky_prefetch,
+    scene_sky_sample,
+    scene_sky_lookup,
+    leave_no_record,
+)
+NO_CACHE = PathCache("none", NoCache, nothing_known)

@@ -7,37 +7,58 @@ One launch serves every term that a pipeline leaves to path tracing: the ray tha
 a path is also the BSDF sample of the direct terms. A constant sky is left to BSDF sampling
 alone, which is better than any mixture for it.
 
-Which light to sample and which way to go on is up to samplers (path_samplers.py); for each
-combination there is a kernel, in a Warp module of its own. Where a sampler is better than the
-BSDF at choosing directions, read "direction sample" for "BSDF sample" above.
+Which light to sample and which way to go on is up to samplers (path_samplers.py), and so is what
+the sky does with a path that leaves, and whether a path may end in what is known of the light at a
+vertex; for each combination there is a kernel, in a Warp module of its own. Where a sampler is
+better than the BSDF at choosing directions, read "direction sample" for "BSDF sample" above.
 """
 
-from functools import cache
+import functools
 from typing import Any, NamedTuple
 
 import warp as wp
 
-from warp_gi.kernels.bsdf import bsdf_evaluate, luminance
+from warp_gi.kernels.bsdf import luminance
 from warp_gi.kernels.bvh import BvhHit, bvh_intersect, bvh_occluded
-from warp_gi.kernels.emitters import LightChoice, may_hit_emitter, sample_emitter, triangle_light_pdf
-from warp_gi.kernels.environment import (
-    environment_lookup,
-    environment_prefetch,
-    environment_radiance,
-    environment_sample,
-)
+from warp_gi.kernels.emitters import may_hit_emitter, triangle_light_pdf
 from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, tiled_pixel
+from warp_gi.kernels.light_connections import (
+    connect_emitter,
+    connect_sky,
+    explore_2d,
+    explore_3d,
+    light_1d,
+    light_2d,
+)
 from warp_gi.kernels.path_samplers import (
     ALIAS_LIGHTS,
     BSDF_DIRECTIONS,
+    NO_CACHE,
     NO_REGIONS,
+    SCENE_SKY,
     DirectionSampler,
     LightSampler,
+    PathCache,
     Regions,
+    Sky,
     no_light,
     sample_weight,
 )
-from warp_gi.kernels.sampling import balance, pixel_sample_index, pixel_seed, random_1d, sample_1d, sample_2d
+from warp_gi.kernels.sampling import (
+    CACHE_DIMENSION,
+    DIRECTION_DIMENSION,
+    EMITTER_DIMENSION,
+    LIGHT_DIMENSION,
+    PATH_DIMENSION,
+    ROULETTE_DIMENSION,
+    SKY_DIGITS_DIMENSION,
+    SKY_DIMENSION,
+    VERTEX_DIMENSIONS,
+    balance,
+    pixel_sample_index,
+    pixel_seed,
+    random_1d,
+)
 from warp_gi.kernels.surface import (
     Surface,
     ray_origin,
@@ -47,15 +68,15 @@ from warp_gi.kernels.surface import (
     surface_shape,
     with_color,
 )
-from warp_gi.kernels.types import ENVIRONMENT_MAP, ENVIRONMENT_NONE, SceneData
+from warp_gi.kernels.types import SceneData
 
 wp.set_module_options({"enable_backward": False})
 
 TERM_ENVIRONMENT = wp.constant(1)
 TERM_EMITTERS = wp.constant(2)
 TERM_INDIRECT = wp.constant(4)
-SHADOW_END = wp.constant(wp.float32(0.9999))  # share of the way to an emitter that must be free
-DIMENSIONS = wp.constant(8)  # dimension pairs a vertex may use; pair 0 is the camera's
+NO_PATH = wp.constant(wp.int64(-1))  # number of a path of which nothing is kept
+CACHE_VERTEX = wp.constant(2)  # PathSettings.cache_vertex unless asked for another one: after one traced bounce
 
 
 @wp.struct
@@ -66,6 +87,7 @@ class PathSettings:
     sky_probability: wp.float32  # of sampling the sky, not an emitter, where a vertex samples one of the two
     clamp: wp.float32  # largest component of a path's indirect radiance; 0: no limit
     spp: wp.int32  # paths of a pixel in all of the frame
+    cache_vertex: wp.int32  # from which on paths may end in a radiance cache: 1 is the first hit; unused without one
 
 
 # Radiance of one path, by term.
@@ -86,100 +108,42 @@ class PathBuffers:
     moment2: wp.array(dtype=wp.vec3)  # of their squares
 
 
-# A light sample that arrives: nothing in between, and the surface reflects some of it.
-@wp.struct
-class LightConnection:
-    arrives: wp.int32  # 1; 0 or, of an emitter with something in between, -1: it does not, and nothing else is set
-    direction: wp.vec3
-    reflected: wp.vec3  # f cos(wi) times the radiance (over the pdf already where `delta`)
-    pdf: wp.float32  # of the light sample
-    bsdf_pdf: wp.float32
-    delta: wp.int32
-
-
-@wp.func
-def connect_sky(scene: SceneData, s: Surface, wo: wp.vec3, u: wp.vec3) -> LightConnection:
-    r = LightConnection()
-    e = environment_sample(scene.environment, u)
-    if e.pdf <= 0.0 or wp.dot(e.direction, s.normal) <= 0.0:
-        return r
-    f = bsdf_evaluate(s.bsdf, wo, wp.transpose(s.shading) * e.direction)
-    if f.pdf <= 0.0:
-        return r
-    if bvh_occluded(scene.bvh, ray_origin(s), e.direction, float(wp.inf)):
-        return r
-    r.arrives = 1
-    r.direction = e.direction
-    r.reflected = wp.cw_mul(f.value, e.radiance)
-    r.pdf = e.pdf
-    r.bsdf_pdf = f.pdf
-    return r
-
-
-@wp.func
-def connect_emitter(scene: SceneData, s: Surface, wo: wp.vec3, choice: LightChoice, u: wp.vec2) -> LightConnection:
-    r = LightConnection()
-    origin = ray_origin(s)
-    e = sample_emitter(scene, origin, choice, u)
-    if e.pdf <= 0.0 or wp.dot(e.direction, s.normal) <= 0.0:
-        return r
-    f = bsdf_evaluate(s.bsdf, wo, wp.transpose(s.shading) * e.direction)
-    if f.pdf <= 0.0 or wp.max(e.radiance) <= 0.0:
-        return r
-    if bvh_occluded(scene.bvh, origin, e.direction, e.distance * SHADOW_END):
-        r.arrives = -1
-        return r
-    r.arrives = 1
-    r.direction = e.direction
-    r.reflected = wp.cw_mul(f.value, e.radiance)
-    r.pdf = e.pdf
-    r.bsdf_pdf = f.pdf
-    r.delta = e.delta
-    return r
-
-
-# Numbers for light samples: stratified where the camera looks, merely random further along a path,
-# where directions that scatter leave little of a stratification to keep.
-@wp.func
-def light_1d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32, at_first: wp.bool) -> wp.float32:
-    if at_first:
-        return sample_1d(index, seed, dimension)
-    return random_1d(index, seed, dimension + 4096)
-
-
-@wp.func
-def light_2d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32, at_first: wp.bool) -> wp.vec2:
-    if at_first:
-        return sample_2d(index, seed, dimension)
-    return wp.vec2(random_1d(index, seed, dimension + 4096), random_1d(index, seed, dimension + 8192))
-
-
-# Numbers for the choice of another light, and for the point on it.
-@wp.func
-def explore_3d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32) -> wp.vec3:
-    u = explore_2d(index, seed, dimension + 2)
-    return wp.vec3(random_1d(index, seed, dimension + 12288), u[0], u[1])
-
-
-@wp.func
-def explore_2d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32) -> wp.vec2:
-    return wp.vec2(random_1d(index, seed, dimension + 12289), random_1d(index, seed, dimension + 12290))
-
-
 class PathTracer(NamedTuple):
     """What is made for one combination of samplers."""
 
     samplers: Any
-    """Struct of the samplers' data: lights, directions, regions."""
+    """Struct of the samplers' data: lights, directions, regions, sky, cache."""
     trace_path: wp.Function
     trace_paths: wp.Kernel
 
 
-@cache
-def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Regions) -> PathTracer:
-    """Return the path tracer that uses these samplers; made once. The regions follow from the samplers."""
+def path_tracer(
+    lights: LightSampler,
+    directions: DirectionSampler,
+    regions: Regions,
+    sky: Sky = SCENE_SKY,
+    cache: PathCache = NO_CACHE,
+) -> PathTracer:
+    """Return the path tracer that uses these samplers, this sky and this radiance cache; made once.
 
+    The regions follow from the samplers (``uses_regions``). Nothing is compiled of a cache that is NO_CACHE, nor of
+    records that SCENE_SKY does not keep.
+    """
+    return _made(lights, directions, regions, sky, cache)
+
+
+def _module_name(lights: LightSampler, directions: DirectionSampler, sky: Sky, cache: PathCache) -> str:
+    """Return the name of a tracer's Warp module: by its samplers, and the hooks that are in use."""
+    hooks = [hook.name for hook, unused in ((sky, SCENE_SKY), (cache, NO_CACHE)) if hook is not unused]
+    return "_".join([f"{__name__}.{lights.name}", directions.name, *hooks])
+
+
+@functools.cache
+def _made(
+    lights: LightSampler, directions: DirectionSampler, regions: Regions, sky: Sky, cache: PathCache
+) -> PathTracer:
     light_data, direction_data, region_data = lights.data, directions.data, regions.data
+    sky_data, cache_data, has_cache = sky.data, cache.data, cache is not NO_CACHE
     explore, choices = (no_light, 1) if lights.explore is None else (lights.explore, 2)
 
     @wp.struct
@@ -187,9 +151,11 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
         lights: light_data
         directions: direction_data
         regions: region_data
+        sky: sky_data
+        cache: cache_data
 
-    # Follows one path from the first hit, the point `surface`, seen from direction `towards_camera`. Its samples are
-    # kept from `slot` on, unless that is -1.
+    # Follows one path from the first hit, the point `surface`, seen from direction `towards_camera`. By its number
+    # `path` regions and the sky know where to keep what they record of it; NO_PATH: nowhere.
     @wp.func
     def trace_path(
         scene: SceneData,
@@ -200,9 +166,12 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
         paths: PathSettings,
         index: wp.uint32,
         seed: wp.uint32,
-        slot: wp.int32,
+        path: wp.int64,
     ) -> PathRadiance:
         r = PathRadiance()
+        slot = int(-1)
+        if path >= wp.int64(0):
+            slot = regions.slot(samplers.regions, path)
         hit = first_hit
         s = surface
         view = towards_camera
@@ -210,27 +179,43 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
         throughput = wp.vec3(1.0, 1.0, 1.0)
         # the same by the BSDF alone: roulette must not end paths for going where light was expected, which lowers it
         reflected = wp.vec3(1.0, 1.0, 1.0)
-        has_sky_map = scene.environment.kind == ENVIRONMENT_MAP
+        samples_sky = sky.is_sampled(samplers.sky, scene)
         for depth in range(2, paths.max_depth + 1):
             at_first = depth == 2
-            d = 1 + (depth - 2) * DIMENSIONS
+            d = PATH_DIMENSION + (depth - 2) * VERTEX_DIMENSIONS
             wo = wp.transpose(s.shading) * view
             region = regions.find(samplers.regions, scene, s, hit.face, hit.u, hit.v)
             at = regions.at(samplers.regions, slot, vertices)
             if at >= 0:
                 regions.begin(samplers.regions, at, s)
+            # All but the direct light may be known here; then the path ends, whatever edges it has left. Learners get
+            # the vertex and its light samples as ever. Of its direction they get none, not even of one that leaves for
+            # the sky: nobody knows how much of what is known came from there, and skies alone would seem to be all.
+            # The vertices before it learn what is known here as light that came their way, as `end` tells them all
+            # that came after their own direction.
+            ends = bool(False)
+            if has_cache:
+                if depth > paths.cache_vertex and (not at_first or (paths.terms & TERM_INDIRECT) != 0):
+                    s = with_color(scene, s)
+                    known = cache.lookup(samplers.cache, scene, s, wo, hit)
+                    ends = known.validity >= 1.0
+                    if known.validity > 0.0 and not ends:
+                        ends = random_1d(index, seed, d + CACHE_DIMENSION) < known.validity
+                    if ends:
+                        r.indirect = r.indirect + wp.cw_mul(throughput, known.radiance)
             # which lights to sample: both at the first vertex, where they are two terms; else one of them
             sky_share = paths.sky_probability
             emitter_share = 1.0 - sky_share
-            wants_sky = has_sky_map
+            wants_sky = samples_sky
             wants_emitter = scene.emitters.count > 0
             u_select = wp.vec2(0.0, 0.0)
             if wants_emitter:
-                u_select = wp.vec2(light_1d(index, seed, d, at_first), random_1d(index, seed, d))
+                u_choice = light_1d(index, seed, d + LIGHT_DIMENSION, at_first)
+                u_select = wp.vec2(u_choice, random_1d(index, seed, d + LIGHT_DIMENSION))
             if at_first:
                 sky_share = 1.0
                 emitter_share = 1.0
-                wants_sky = has_sky_map and (paths.terms & TERM_ENVIRONMENT) != 0
+                wants_sky = samples_sky and (paths.terms & TERM_ENVIRONMENT) != 0
                 wants_emitter = wants_emitter and (paths.terms & TERM_EMITTERS) != 0
             elif u_select[0] < sky_share:
                 wants_emitter = False
@@ -239,18 +224,18 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
                 u_select = wp.vec2((u_select[0] - sky_share) / emitter_share, u_select[1])
             u_sky = wp.vec3(0.0, 0.0, 0.0)
             if wants_sky:
-                u2 = light_2d(index, seed, d + 1, at_first)
-                u_sky = wp.vec3(u2[0], u2[1], random_1d(index, seed, d + 2))
-                environment_prefetch(scene.environment, u_sky)
+                u2 = light_2d(index, seed, d + SKY_DIMENSION, at_first)
+                u_sky = wp.vec3(u2[0], u2[1], random_1d(index, seed, d + SKY_DIGITS_DIMENSION))
+                sky.prefetch(samplers.sky, scene, u_sky)
 
             # the way on: ends the path at a light, or continues it
-            is_last = depth == paths.max_depth or (at_first and (paths.terms & TERM_INDIRECT) == 0)
-            sees_sky = scene.environment.kind != ENVIRONMENT_NONE
+            is_last = ends or depth == paths.max_depth or (at_first and (paths.terms & TERM_INDIRECT) == 0)
+            sees_sky = sky.is_lit(samplers.sky, scene)
             sees_emitters = scene.emitters.count > 0
             if at_first:
                 sees_sky = sees_sky and (paths.terms & TERM_ENVIRONMENT) != 0
                 sees_emitters = sees_emitters and (paths.terms & TERM_EMITTERS) != 0
-            b = directions.sample(samplers.directions, region, s, wo, index, seed, d + 4)
+            b = directions.sample(samplers.directions, region, s, wo, index, seed, d + DIRECTION_DIMENSION)
             wi = b.wi
             goes_on = b.pdf > 0.0 and wp.dot(wi, s.normal) > 0.0
             hit.face = -1
@@ -271,17 +256,21 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
                 s = with_color(scene, s)
             # light sampling; after the ray above, which gives memory the time to answer the prefetches
             if wants_sky:
-                sky_sample = connect_sky(scene, s, wo, u_sky)
+                sky_sample = connect_sky(scene, s, wo, sky.sample(samplers.sky, scene, u_sky))
                 if sky_sample.arrives != 0:
                     pdf = directions.pdf(samplers.directions, region, s, sky_sample.direction, sky_sample.bsdf_pdf)
-                    light = sky_sample.reflected / (sky_sample.pdf * sky_share + pdf)
+                    pdf = sky_sample.pdf * sky_share + pdf
+                    light = sky_sample.reflected / pdf
+                    if path >= wp.int64(0):
+                        weight = wp.cw_mul(throughput, sky_sample.scattered / pdf)
+                        sky.leave(samplers.sky, path, depth, sky_sample.direction, weight)
                     if at_first:
                         r.environment = light
                     else:
                         r.indirect = r.indirect + wp.cw_mul(throughput, light)
             if wants_emitter:
                 choice = lights.choose(samplers.lights, scene, region, s, wo, u_select)
-                u_point = light_2d(index, seed, d + 3, at_first)
+                u_point = light_2d(index, seed, d + EMITTER_DIMENSION, at_first)
                 for turn in range(int(choices)):
                     if turn > 0:
                         u_explore = explore_3d(index, seed, d)
@@ -309,14 +298,18 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
             throughput = wp.cw_mul(throughput, sample_weight(s.bsdf, b.weight))
             reflected = wp.cw_mul(reflected, sample_weight(s.bsdf, b.reflected))
             if hit.face < 0:
-                if at >= 0:
+                if at >= 0 and not ends:
                     regions.direction(samplers.regions, at, b, 0.0, carried, luminance(r.environment + r.indirect))
                 vertices += 1
                 if sees_sky:
-                    sky = environment_lookup(scene.environment, wi)
-                    light = wp.cw_mul(throughput, sky.radiance)
-                    if has_sky_map:
-                        light = light * balance(b.pdf, sky_share * sky.pdf)
+                    beyond = sky.lookup(samplers.sky, scene, wi)
+                    light = wp.cw_mul(throughput, beyond.radiance)
+                    share = float(1.0)
+                    if samples_sky:
+                        share = balance(b.pdf, sky_share * beyond.pdf)
+                        light = light * share
+                    if path >= wp.int64(0):
+                        sky.leave(samplers.sky, path, depth, wi, throughput * share)
                     if at_first:
                         r.environment = r.environment + light
                     else:
@@ -340,7 +333,7 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
                 break
             if depth >= paths.roulette_depth:
                 survival = wp.min(wp.max(wp.max(throughput), wp.max(reflected)), 0.95)
-                if random_1d(index, seed, d + 6) >= survival:
+                if random_1d(index, seed, d + ROULETTE_DIMENSION) >= survival:
                     break
                 throughput = throughput / survival
                 reflected = reflected / survival
@@ -351,7 +344,7 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
         return r
 
     # Thread: a pixel. Adds `sample_count` paths from its current camera sample.
-    @wp.kernel(module=wp.get_module(f"{__name__}.{lights.name}_{directions.name}"), enable_backward=False)
+    @wp.kernel(module=wp.get_module(_module_name(lights, directions, sky, cache)), enable_backward=False)
     def trace_paths(
         first: wp.int32,
         scene: SceneData,
@@ -370,9 +363,9 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
         direction = hits.direction[pixel]
         count = wp.float32(settings.sample_count)
         if face < 0:
-            sky = environment_radiance(scene.environment, direction)
-            buffers.moment1[pixel] = buffers.moment1[pixel] + sky * count
-            buffers.moment2[pixel] = buffers.moment2[pixel] + wp.cw_mul(sky, sky) * count
+            background = sky.lookup(samplers.sky, scene, direction).radiance
+            buffers.moment1[pixel] = buffers.moment1[pixel] + background * count
+            buffers.moment2[pixel] = buffers.moment2[pixel] + wp.cw_mul(background, background) * count
             return
         emission = surface_emission(scene, face, hits.u[pixel], hits.v[pixel], -direction)
         if paths.terms == 0:
@@ -393,8 +386,7 @@ def path_tracer(lights: LightSampler, directions: DirectionSampler, regions: Reg
         first_index = pixel_sample_index(p[0], p[1], settings.first_sample, settings.sample_bits)
         for i in range(settings.sample_count):
             path = wp.int64(first + wp.tid()) * wp.int64(paths.spp) + wp.int64(settings.first_sample + i)
-            slot = regions.slot(samplers.regions, path)
-            r = trace_path(scene, samplers, hit, s, -direction, paths, first_index + wp.uint32(i), seed, slot)
+            r = trace_path(scene, samplers, hit, s, -direction, paths, first_index + wp.uint32(i), seed, path)
             brightest = wp.max(r.indirect)
             if paths.clamp > 0.0 and brightest > paths.clamp:
                 r.indirect = r.indirect * (paths.clamp / brightest)

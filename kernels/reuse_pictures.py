@@ -14,6 +14,7 @@ from warp_gi.kernels.octahedral import octahedral_decode, octahedral_encode
 from warp_gi.kernels.octree import Octree, cell_code, octree_leaf
 from warp_gi.kernels.parallax import seen_from_anchor
 from warp_gi.kernels.path_trace import (
+    NO_PATH,
     TERM_EMITTERS,
     TERM_ENVIRONMENT,
     TERM_INDIRECT,
@@ -22,13 +23,11 @@ from warp_gi.kernels.path_trace import (
     trace_path,
 )
 from warp_gi.kernels.quadtree import quadtree_locate, quadtree_pdf
-from warp_gi.kernels.sampling import morton_code, sample_2d
+from warp_gi.kernels.sampling import CAMERA_DIMENSION, morton_code, sample_2d
 from warp_gi.kernels.surface import ray_origin, surface_at
 from warp_gi.kernels.types import SceneData
 
 wp.set_module_options({"enable_backward": False})
-
-JITTER_DIMENSION = wp.constant(0)  # paths begin with 1
 
 
 # What rays through the middles of pixels meet, [item].
@@ -86,7 +85,7 @@ def incident_luminance(scene: SceneData, incident: IncidentMap, direction: wp.ve
     paths.roulette_depth = incident.roulette_depth
     paths.sky_probability = incident.sky_probability
     s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
-    path = trace_path(scene, PathSamplers(), hit, s, -direction, paths, index, incident.seed, -1)
+    path = trace_path(scene, PathSamplers(), hit, s, -direction, paths, index, incident.seed, NO_PATH)
     return luminance(path.environment + path.emitters + path.indirect)
 
 
@@ -100,7 +99,7 @@ def map_incident_light(first: wp.int32, scene: SceneData, incident: IncidentMap)
     total = float(0.0)
     for ray in range(incident.rays):
         index = begin + wp.uint32(ray)
-        u = sample_2d(index, incident.seed, JITTER_DIMENSION)
+        u = sample_2d(index, incident.seed, CAMERA_DIMENSION)
         uv = wp.vec2(wp.float32(column) + u[0], wp.float32(row) + u[1]) / wp.float32(incident.resolution)
         total += incident_luminance(scene, incident, octahedral_decode(uv), index)
     incident.light[texel] = total / wp.float32(incident.rays)

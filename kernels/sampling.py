@@ -14,6 +14,65 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+# ---- dimensions: who draws which random numbers ----
+#
+# A number is stratified (sample_1d, sample_2d) or only random (random_1d); the two kinds never meet, whatever their
+# dimensions. Within a kind, numbers of one index and one seed are independent if their dimensions differ. So whatever
+# one launch draws by one index and seed needs dimensions of its own; all of them are named here, launch by launch, and
+# tests/kernels/test_dimensions.py holds the launches against each other.
+
+# Camera rays and whatever else starts before a path: the point in a pixel or in a texel.
+CAMERA_DIMENSION = wp.constant(0)
+
+# Paths. Vertex k (0 is the first hit) has the dimensions PATH_DIMENSION + k VERTEX_DIMENSIONS and so many after it.
+# Numbers that are only random stand apart by thousands; they leave room for 511 vertices.
+PATH_DIMENSION = wp.constant(1)
+VERTEX_DIMENSIONS = wp.constant(8)
+LIGHT_DIMENSION = wp.constant(0)  # offsets at a vertex, from here on: which light to sample (1d; its digits random)
+SKY_DIMENSION = wp.constant(1)  # the direction of the sky sample (2d)
+SKY_DIGITS_DIMENSION = wp.constant(2)  # further digits of the first of the two (random)
+EMITTER_DIMENSION = wp.constant(3)  # the point on the emitter (2d)
+DIRECTION_DIMENSION = wp.constant(4)  # direction samplers: the lobe (1d) here, the direction (2d) in the one after
+ROULETTE_DIMENSION = wp.constant(6)  # whether the path goes on (random)
+CACHE_DIMENSION = wp.constant(7)  # whether the path ends in a radiance cache that is valid in part (random)
+FURTHER_DIMENSIONS = wp.constant(4096)  # added to those of light samples beyond the first vertex, which are random:
+FURTHER_SECOND_DIMENSIONS = wp.constant(8192)  # to that of a number or of the first of a pair; to that of the second
+GUIDE_DIMENSIONS = wp.constant(8192)  # the leaf of a guide's quadtree (random); added to DIRECTION_DIMENSION
+EXPLORE_DIMENSION = wp.constant(12288)  # which other light to explore (random),
+EXPLORE_POINT_DIMENSION = wp.constant(12289)  # a pair for the point on it (random),
+EXPLORE_DIGITS_DIMENSION = wp.constant(2)  # and how far from that pair is another one, for the choice
+
+# Rays from pixels that end in light field probes, beside the path that may go on from where they end: its vertices
+# stay below, as it has BsdfPaths' default depth.
+PROBE_LOBE_DIMENSION = wp.constant(2000)
+PROBE_RAY_DIMENSION = wp.constant(2001)
+PROBE_PIXEL_DIMENSION = wp.constant(2002)  # whether the pixel goes by the probes (random)
+PROBE_HIT_DIMENSION = wp.constant(2003)  # whether the end of the ray does (random)
+
+# Paths that tell where a camera's light goes over (light_field_place): so many dimensions a vertex, the lobe and the
+# direction, after CAMERA_DIMENSION.
+REACH_DIMENSION = wp.constant(1)
+REACH_VERTEX_DIMENSIONS = wp.constant(3)
+
+# A visibility field's bake, by surface sample.
+SURFACE_PIECE_DIMENSION = wp.constant(1)  # random
+SURFACE_POINT_DIMENSION = wp.constant(2)
+SURFACE_TURN_DIMENSION = wp.constant(3)  # random
+
+# A visibility field's sets of directions, by sample of a set, and the turn of a pixel's set.
+SET_TURN_DIMENSION = wp.constant(0)
+SET_SKY_DIMENSION = wp.constant(1)
+SET_SKY_DIGITS_DIMENSION = wp.constant(2)  # random
+SET_COSINE_DIMENSION = wp.constant(3)
+
+# Pixels lit by a visibility field.
+FIELD_BSDF_DIMENSION = wp.constant(101)  # the direction by the BSDF; random: which of these samples are verified
+FIELD_LIGHT_DIMENSION = wp.constant(102)  # which light samples are verified (random)
+FIELD_LOBE_DIMENSION = wp.constant(103)  # which lobe of a glossy surface (random)
+FIELD_SET_DIMENSION = wp.constant(104)  # which set of light samples a pixel takes (random)
+
+# ---- numbers ----
+
 _INTEGER_CODE = """
 typedef unsigned int Word;
 struct Bits {

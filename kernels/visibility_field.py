@@ -15,6 +15,8 @@ import warp as wp
 from warp_gi.kernels.bvh import bvh_occluded, bvh_occluder
 from warp_gi.kernels.octahedral import octahedral_encode, octahedral_texel
 from warp_gi.kernels.sampling import (
+    SET_COSINE_DIMENSION,
+    SET_TURN_DIMENSION,
     circle,
     cosine_direction,
     hash_uint,
@@ -358,7 +360,7 @@ def turned_frame(frame: wp.mat33, turn: wp.float32) -> wp.mat33:
 
 @wp.func
 def pixel_turn(morton: wp.uint32, seed: wp.uint32) -> wp.float32:
-    return sample_1d(morton, seed, 0)
+    return sample_1d(morton, seed, SET_TURN_DIMENSION)
 
 
 # The seed of a pixel's own random numbers.
@@ -371,6 +373,6 @@ def own_seed(morton: wp.uint32, seed: wp.uint32) -> wp.uint32:
 @wp.kernel
 def draw_cosines(first: wp.int32, seed: wp.uint32, query: FieldQuery):
     k = first + wp.tid()
-    d = cosine_direction(sample_2d(wp.uint32(k), seed, 3))
+    d = cosine_direction(sample_2d(wp.uint32(k), seed, SET_COSINE_DIMENSION))
     for row in range(3):
         query.cosines[row, k] = d[row]

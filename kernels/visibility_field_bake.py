@@ -11,7 +11,15 @@ import warp as wp
 
 from warp_gi.kernels.bvh import bvh_intersect
 from warp_gi.kernels.gbuffer import CameraData, camera_ray, tiled_pixel
-from warp_gi.kernels.sampling import frame_of, hash_uint, random_1d, sample_2d
+from warp_gi.kernels.sampling import (
+    SURFACE_PIECE_DIMENSION,
+    SURFACE_POINT_DIMENSION,
+    SURFACE_TURN_DIMENSION,
+    frame_of,
+    hash_uint,
+    random_1d,
+    sample_2d,
+)
 from warp_gi.kernels.surface import ray_offset, ray_origin, surface_shape
 from warp_gi.kernels.types import Bvh, Geometry, SceneData
 from warp_gi.kernels.visibility_field import (
@@ -279,7 +287,7 @@ def surface_sample(geometry: Geometry, cells: CellSurfaces, slot: wp.int32, k: w
     upper = int(last)
     if k < count:
         i = wp.int32(wp.int64(k) * wp.int64(cells.step[slot]) % wp.int64(count))
-        share = (wp.float32(i) + random_1d(wp.uint32(i), seed, 1)) / wp.float32(count)
+        share = (wp.float32(i) + random_1d(wp.uint32(i), seed, SURFACE_PIECE_DIMENSION)) / wp.float32(count)
         wanted = share * cells.area[last]
         while lower < upper:
             middle = (lower + upper) / 2
@@ -288,7 +296,7 @@ def surface_sample(geometry: Geometry, cells: CellSurfaces, slot: wp.int32, k: w
             else:
                 lower = middle + 1
         t = side_triangle(geometry, cells.side[lower], cells.search.radius)
-        u = sample_2d(wp.uint32(i), seed, 2)
+        u = sample_2d(wp.uint32(i), seed, SURFACE_POINT_DIMENSION)
         s.origin = piece_point(t.p0, t.p1, t.p2, low, high, u[0], u[1])
         s.normal = t.normal
     else:
@@ -337,7 +345,7 @@ def bake_masks(
     traced = int(0)
     for k in range(chunks.begin[chunk], chunks.end[chunk]):
         s = surface_sample(geometry, cells, slot, k)
-        frame = turned_frame(frame_of(s.normal), random_1d(s.hash, cells.seed, 3))
+        frame = turned_frame(frame_of(s.normal), random_1d(s.hash, cells.seed, SURFACE_TURN_DIMENSION))
         rays = wp.int32(s.hash % wp.uint32(query.set_count)) * query.set_size
         for ray in range(0, chunks.rays, 8):
             octet = cosine_octet(settled, query.cosines, slot, rays + ray, frame, s.normal)

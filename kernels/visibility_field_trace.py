@@ -18,7 +18,19 @@ from warp_gi.kernels.bvh import bvh_occluded
 from warp_gi.kernels.environment import environment_lookup, environment_sample
 from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, tiled_pixel
 from warp_gi.kernels.harmonics import Harmonics, cosine_harmonics, harmonics, vec9
-from warp_gi.kernels.sampling import morton_code, pixel_sample_index, pixel_seed, random_1d, sample_2d
+from warp_gi.kernels.sampling import (
+    FIELD_BSDF_DIMENSION,
+    FIELD_LIGHT_DIMENSION,
+    FIELD_LOBE_DIMENSION,
+    FIELD_SET_DIMENSION,
+    SET_SKY_DIGITS_DIMENSION,
+    SET_SKY_DIMENSION,
+    morton_code,
+    pixel_sample_index,
+    pixel_seed,
+    random_1d,
+    sample_2d,
+)
 from warp_gi.kernels.surface import Surface, ray_origin, shading_normal, surface_shape, with_color
 from warp_gi.kernels.types import SceneData
 from warp_gi.kernels.visibility_field import (
@@ -52,10 +64,6 @@ wp.set_module_options({"enable_backward": False})
 SKY_CONSTANT = wp.constant(0)
 SKY_HARMONIC = wp.constant(1)
 SKY_MAP = wp.constant(2)
-BSDF_DIMENSION = wp.constant(101)  # of random numbers: which BSDF samples are verified,
-LIGHT_DIMENSION = wp.constant(102)  # which light samples,
-LOBE_DIMENSION = wp.constant(103)  # which lobe of a glossy surface,
-SET_DIMENSION = wp.constant(104)  # which set of light samples a pixel takes
 
 
 # The sky as this estimator sees it.
@@ -162,7 +170,7 @@ def verified_lanes(query: FieldQuery, p: FieldPixel, bits: wp.int32, start: wp.i
     while todo != 0:
         lane = lowest_bit(todo)
         todo = todo & (todo - 1)
-        if random_1d(wp.uint32(start + lane), p.seed, BSDF_DIMENSION) < query.verify:
+        if random_1d(wp.uint32(start + lane), p.seed, FIELD_BSDF_DIMENSION) < query.verify:
             picked = picked | (1 << lane)
     return picked
 
@@ -336,11 +344,12 @@ def glossy_samples(
 ) -> FieldSums:
     sums = FieldSums()
     for sample in range(p.first, p.first + p.count):
-        lobe = random_1d(wp.uint32(sample), p.seed, LOBE_DIMENSION)
-        b = bsdf_sample(s.bsdf, wo, lobe, sample_2d(p.index_base + wp.uint32(sample), p.index_seed, BSDF_DIMENSION))
+        lobe = random_1d(wp.uint32(sample), p.seed, FIELD_LOBE_DIMENSION)
+        u = sample_2d(p.index_base + wp.uint32(sample), p.index_seed, FIELD_BSDF_DIMENSION)
+        b = bsdf_sample(s.bsdf, wo, lobe, u)
         direction = s.shading * b.wi
         if b.pdf > 0.0 and wp.dot(direction, s.normal) > 0.0:
-            passed = sky_visibility(scene, grid, query, p, direction, sample, BSDF_DIMENSION)
+            passed = sky_visibility(scene, grid, query, p, direction, sample, FIELD_BSDF_DIMENSION)
             if passed != 0.0:
                 weight = bsdf_weight(s.bsdf, b) * passed
                 light = wp.cw_mul(weight, weighted_sky(scene, sky, direction, b.pdf))
@@ -369,13 +378,13 @@ def light_samples(
 ) -> FieldSums:
     r = sums
     normal = shading_normal(s)
-    chosen = wp.int32(random_1d(wp.uint32(0), p.seed, SET_DIMENSION) * wp.float32(sky.set_count))
+    chosen = wp.int32(random_1d(wp.uint32(0), p.seed, FIELD_SET_DIMENSION) * wp.float32(sky.set_count))
     for i in range(p.first, p.first + p.count):
         k = (chosen + i / sky.set_size) % sky.set_count * sky.set_size + i % sky.set_size
         direction = sky.directions[k]
         pdf = sky.pdfs[k]
         if pdf > 0.0 and wp.dot(direction, s.normal) > 0.0 and wp.dot(direction, normal) > 0.0:
-            passed = sky_visibility(scene, grid, query, p, direction, i, LIGHT_DIMENSION)
+            passed = sky_visibility(scene, grid, query, p, direction, i, FIELD_LIGHT_DIMENSION)
             if passed != 0.0:
                 f = bsdf_evaluate(s.bsdf, wo, wp.transpose(s.shading) * direction)
                 if f.pdf > 0.0:
@@ -444,8 +453,9 @@ def trace_field(
 @wp.kernel
 def sample_sky(first: wp.int32, scene: SceneData, seed: wp.uint32, sky: FieldSky):
     k = first + wp.tid()
-    u = sample_2d(wp.uint32(k), seed, 1)
-    e = environment_sample(scene.environment, wp.vec3(u[0], u[1], random_1d(wp.uint32(k), seed, 2)))
+    u = sample_2d(wp.uint32(k), seed, SET_SKY_DIMENSION)
+    digits = random_1d(wp.uint32(k), seed, SET_SKY_DIGITS_DIMENSION)
+    e = environment_sample(scene.environment, wp.vec3(u[0], u[1], digits))
     sky.directions[k] = e.direction
     sky.pdfs[k] = e.pdf
     sky.radiances[k] = e.radiance

@@ -224,6 +224,7 @@ class Frame:
         settings.terms, settings.max_depth = request.terms, request.max_depth
         settings.roulette_depth, settings.clamp = request.roulette_depth, request.clamp
         settings.sky_probability, settings.spp = self.sky_probability, self.settings.spp
+        settings.cache_vertex = request.cache_vertex
         if request.table is not None:
             self.data.emitters.alias = request.table
         elif self.scene.emitter_count and request.lights.sampler is path_samplers.ALIAS_LIGHTS:

@@ -40,6 +40,12 @@ class PathRequest:
         self.directions = SamplerInUse(path_samplers.BSDF_DIRECTIONS, path_samplers.BsdfDirections())
         self.regions = SamplerInUse(path_samplers.NO_REGIONS, path_samplers.NoRegions())
         """Regions of space that samplers tell apart. Set by ``prepare``, if a sampler uses regions."""
+        self.sky = SamplerInUse(path_samplers.SCENE_SKY, path_samplers.SceneSky())
+        """What paths meet where they leave the scene."""
+        self.cache = SamplerInUse(path_samplers.NO_CACHE, path_samplers.NoCache())
+        """Radiance cache that paths may end in."""
+        self.cache_vertex = int(path_trace.CACHE_VERTEX)
+        """Vertex from which on they may: 1 is the first hit."""
         self.table: wp.array | None = None
         """Alias table over emitters, AliasBucket [emitter]; None is that of the scene, by power."""
         self.terms = 0
@@ -71,6 +77,14 @@ class PathRequest:
         """
         self._regions = regions, data
 
+    def use_sky(self, sky: path_samplers.Sky, data: Any) -> None:
+        """Let paths that leave the scene meet ``sky`` in place of the scene's; ``data`` is its struct."""
+        self.sky = SamplerInUse(sky, data)
+
+    def use_cache(self, cache: path_samplers.PathCache, data: Any, vertex: int = int(path_trace.CACHE_VERTEX)) -> None:
+        """Let paths end in a radiance cache from a vertex on; ``data`` is its struct. 1 is the first hit."""
+        self.cache, self.cache_vertex = SamplerInUse(cache, data), vertex
+
     def want(self, term: str, max_depth: int | None = None, roulette_depth: int = 5, clamp: float = 0.0) -> None:
         """Ask for a term of the light in the current camera sample.
 
@@ -93,7 +107,8 @@ class PathRequest:
 
     def samplers(self) -> tuple[Any, ...]:
         """Return the arguments of ``kernels.path_trace.path_tracer``."""
-        return self.lights.sampler, self.directions.sampler, self.regions.sampler
+        used = self.lights, self.directions, self.regions, self.sky, self.cache
+        return tuple(one.sampler for one in used)
 
     def begin(self) -> None:
         """Forget the terms of the last camera sample."""

@@ -34,9 +34,9 @@ from statistics_tools import device, every_device  # noqa: F401
 
 import warp_gi as gi
 from warp_gi.bench.harness.presets import light, quad
-from warp_gi.kernels import path_trace, samples, surface, types
+from warp_gi.kernels import light_connections, samples, surface, types
 from warp_gi.kernels.emitters import LightChoice
-from warp_gi.kernels.sampling import random_1d
+from warp_gi.kernels.sampling import EMITTER_DIMENSION, PATH_DIMENSION, VERTEX_DIMENSIONS, random_1d
 from warp_gi.launch import launch
 from warp_gi.techniques.reuse.light_cache import MOVING_EXPLORATION
 
@@ -61,7 +61,7 @@ def connect(
     choice.item = i - 1
     choice.pdf = 0.5
     choice.weight = 1.0
-    found = path_trace.connect_emitter(scene, s, wp.transpose(s.shading) * view, choice, numbers[k])
+    found = light_connections.connect_emitter(scene, s, wp.transpose(s.shading) * view, choice, numbers[k])
     arrives[i, k] = found.arrives
     brings[i, k] = wp.vec2(found.pdf, wp.max(found.reflected))
 
@@ -398,16 +398,16 @@ def ask_numbers(first: wp.int32, numbers: wp.array2d(dtype=wp.float32)):
     index = wp.uint32(i)
     seed = wp.uint32(77)
     for vertex in range(3):
-        d = 1 + vertex * path_trace.DIMENSIONS
-        u = path_trace.explore_3d(index, seed, d)
-        v = path_trace.explore_2d(index, seed, d)
-        w = path_trace.light_2d(index, seed, d + 3, False)
+        d = PATH_DIMENSION + vertex * VERTEX_DIMENSIONS
+        u = light_connections.explore_3d(index, seed, d)
+        v = light_connections.explore_2d(index, seed, d)
+        w = light_connections.light_2d(index, seed, d + EMITTER_DIMENSION, False)
         for k in range(3):
             numbers[i, vertex * 9 + k] = u[k]
         for k in range(2):
             numbers[i, vertex * 9 + 3 + k] = v[k]
             numbers[i, vertex * 9 + 5 + k] = w[k]
-        numbers[i, vertex * 9 + 7] = path_trace.light_1d(index, seed, d, False)
+        numbers[i, vertex * 9 + 7] = light_connections.light_1d(index, seed, d, False)
         numbers[i, vertex * 9 + 8] = random_1d(index, seed, d)
 
 

@@ -15,8 +15,8 @@ from warp_gi.kernels.bsdf import lambert
 from warp_gi.kernels.bvh import BvhHit
 from warp_gi.kernels.gbuffer import PrimaryHits
 from warp_gi.kernels.light_field import LightField
-from warp_gi.kernels.light_field_trace import seen_light
-from warp_gi.kernels.path_trace import TERM_INDIRECT, PathSamplers, PathSettings, trace_path
+from warp_gi.kernels.light_field_cache import seen_light
+from warp_gi.kernels.path_trace import NO_PATH, TERM_INDIRECT, PathSamplers, PathSettings, trace_path
 from warp_gi.kernels.sampling import pixel_sample_index, pixel_seed
 from warp_gi.kernels.surface import ray_origin, shading_normal, surface_at
 from warp_gi.kernels.types import SceneData
@@ -85,7 +85,7 @@ def gather_irradiance(
     of_pixel = pixel_seed(x, y, sample_bits, seed)
     total = wp.vec3(0.0, 0.0, 0.0)
     for i in range(paths.spp):
-        light = trace_path(scene, PathSamplers(), hit, s, towards, paths, index + wp.uint32(i), of_pixel, -1)
+        light = trace_path(scene, PathSamplers(), hit, s, towards, paths, index + wp.uint32(i), of_pixel, NO_PATH)
         total = total + light.indirect
     irradiance[pixel] = total * (wp.pi / wp.float32(paths.spp))
 

@@ -15,8 +15,10 @@ from warp_gi.baking import Bake
 from warp_gi.errors import BakeError, OptionError, check_whole, unknown_name
 from warp_gi.estimator import Ahead, Estimator
 from warp_gi.kernels import light_field as field_kernels
+from warp_gi.kernels import light_field_cache
 from warp_gi.kernels import light_field_trace as trace_kernels
 from warp_gi.primary import Primary
+from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.techniques.light_field.places import MOST_PROBES, camera_rows, cameras_of, lit_data, map_resolution
 from warp_gi.techniques.light_field.state import ProbeState, path_settings, sky_bytes
@@ -32,7 +34,7 @@ _MODES = {
     "traced": trace_kernels.MODE_TRACED,
 }
 _THROUGH = {"geometry": trace_kernels.RAYS_GEOMETRY, "probes": trace_kernels.RAYS_PROBES}
-VISIBILITIES = {"probes": trace_kernels.VISIBILITY_PROBES, "exact": trace_kernels.VISIBILITY_EXACT}
+VISIBILITIES = {"probes": light_field_cache.VISIBILITY_PROBES, "exact": light_field_cache.VISIBILITY_EXACT}
 _PRIMARIES = ("geometry", "probes")
 _WEIGHTS = ("visibility", "trilinear")
 MOST_RESOLUTION = 1024
@@ -45,7 +47,7 @@ SETTLED = 0.02
 
 
 @dataclass(frozen=True)
-class LightFieldProbes(Estimator):
+class LightFieldProbes(Estimator, RadianceCache):
     """Indirect light from a grid of probes that hold radiance, normals and distances all around.
 
     Biased: by how many probes there are, how finely they look, and by what a probe cannot see. (McGuire et al. 2017,
@@ -235,6 +237,12 @@ class LightFieldProbes(Estimator):
         """Refreshes of a probe until what it saw before no longer counts, and light has bounced a few times."""
         fading = math.ceil(math.log(SETTLED) / math.log(self.hysteresis)) if self.hysteresis > 0 else 1
         return max(fading, 4)
+
+    def give(self, frame: Frame, state: ProbeState) -> None:
+        """Let paths end in what probes know: the light that surfaces reflect, as irradiance."""
+        cache = light_field_cache.ProbeCache()
+        cache.field, cache.visibility = state.field, VISIBILITIES[self.visibility]
+        frame.paths.use_cache(light_field_cache.PROBE_CACHE, cache)
 
     def trace(self, frame: Frame, state: ProbeState) -> None:
         """Add the light of the current camera sample."""

@@ -14,6 +14,7 @@ TECHNIQUE = Technique(
             "indirect": ("LightFieldProbes", {"primary": "probes"}),
         },
     },
+    samplers=("light_field_cache.PROBE_CACHE",),
     bake_tool="bake_tool",
     suite="probes",
     page="techniques/light_field_probes.md",
