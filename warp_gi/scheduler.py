@@ -142,12 +142,17 @@ class FrameScheduler:
         return part.start(self.scene, device, bake, self.seed)
 
     def _bake_for(self, part: Stateful) -> Bake | None:
-        """Return the bake that was given for a part: of several for its class, one with its settings."""
-        given = self._bakes.get(type(part).__name__, [])
-        if len(given) > 1:
-            settings = part.bake_settings(self.scene)
-            given = [bake for bake in given if bake.has(settings)] or given
-        return given[-1] if given else None
+        """Return the bake that was given for a part, or None.
+
+        Of several for its class it is one with the part's settings. A bake that fits another part of the class is not
+        for this one. One that fits none is returned, for ``Bake.check`` to say why.
+        """
+        given = self._bakes[type(part).__name__]
+        mine = [bake for bake in given if bake.has(part.bake_settings(self.scene))] or given
+        others = [one.bake_settings(self.scene) for one in self._parts.values() if type(one) is type(part)]
+        if mine is given and any(bake.has(settings) for bake in given for settings in others):
+            return None
+        return mine[-1] if mine else None
 
     def state(self, place: str) -> Any:
         """Return the state of a part of the pipeline as the last frame left it.
@@ -290,13 +295,13 @@ class FrameScheduler:
 
 def _bakes_by_class(bakes: Iterable[Bake], parts: dict[str, Stateful]) -> dict[str, list[Bake]]:
     """Return the bakes by the class that they are for; raises BakeError for one that nothing uses."""
-    classes = {type(part).__name__: [] for place, part in parts.items() if place != DENOISER}
+    found: dict[str, list[Bake]] = {type(part).__name__: [] for part in parts.values()}
     for one in bakes:
-        if one.technique not in classes:
-            names = ", ".join(sorted(classes)) or "none"
+        if one.technique not in found:
+            names = ", ".join(sorted(found)) or "none"
             raise BakeError(f"a bake of {one.technique} was given, but the pipeline's estimators are: {names}")
-        classes[one.technique].append(one)
-    return classes
+        found[one.technique].append(one)
+    return found
 
 
 def _mix(seed: int, frame: int) -> int:
