@@ -47,7 +47,9 @@ def _directive(name: str) -> str:
     lines = [f"::: {path}", "    options:", f"      heading: warp_gi.{name}", f"      toc_label: {name}"]
     if isinstance(value, type) and issubclass(value, (Estimator, Denoiser)) and value not in (Estimator, Denoiser):
         settings = [field.name for field in dataclasses.fields(value)]
-        lines += ["      inherited_members: true", f"      members: {settings}"] if settings else ["      members: false"]
+        lines += (
+            ["      inherited_members: true", f"      members: {settings}"] if settings else ["      members: false"]
+        )
     return "\n".join(lines)
 
 

@@ -39,12 +39,22 @@ def write(folder, blocks):
 
 
 def run(folder):
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", folder, folder / "files" / TEST]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "--rootdir",
+        folder,
+        folder / "files" / TEST,
+    ]
     return subprocess.run(command, capture_output=True, text=True, cwd=folder)
 
 
 def test_the_files_of_the_guide_render_the_known_answer(tmp_path, blocks):
-    assert list(blocks)[0] == "kernels/ambient_occlusion.py" and list(blocks)[-1] == TEST and len(blocks) == 5
+    assert next(iter(blocks)) == "kernels/ambient_occlusion.py" and list(blocks)[-1] == TEST and len(blocks) == 5
     write(tmp_path, blocks)
     result = run(tmp_path)
     assert result.returncode == 0 and "4 passed" in result.stdout, result.stdout + result.stderr
