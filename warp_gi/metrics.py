@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_gi.errors import OptionError
+from warp_gi.errors import OptionError, one_line
 from warp_gi.sequence.preview import decode_srgb
 
 RELATIVE_EPSILON = 1e-2
@@ -82,7 +82,7 @@ def _ldr_flip(a: np.ndarray, r: np.ndarray, pixels_per_degree: float) -> np.ndar
     a, r = (oiio.ImageBuf(np.ascontiguousarray(np.clip(x, 0, 1), np.float32)) for x in (a, r))
     result = oiio.ImageBufAlgo.FLIP_diff(r, a, hdr=0, ppd=pixels_per_degree)
     if result.has_error:
-        raise OptionError(f"FLIP: {' '.join(result.geterror().split())}")
+        raise OptionError(f"FLIP: {one_line(result.geterror())}")
     return np.ascontiguousarray(result.get_pixels(oiio.FLOAT)[:, :, 0])
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_gi.errors import one_line
+
 PADDING = 1
 GPU_TEXELS = 16384
 """Along a side of a texture; what graphics hardware takes."""
@@ -108,5 +110,5 @@ def write_parts(
         done = done and output.write_image(np.ascontiguousarray(pixels(index) if index else first))
     done = output.close() and done
     if not done or output.has_error:
-        problem = " ".join(output.geterror().split()) or "unknown failure"
+        problem = one_line(output.geterror(), "unknown failure")
         raise OSError(f"cannot write {path}: {problem.replace(str(part), str(path))}")
