@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Container, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import wraps
@@ -23,7 +23,7 @@ from warp_gi.estimator import Ahead, Estimator, SamplerInUse
 from warp_gi.kernels import compose, denoise, gbuffer, path_samplers, path_trace, path_tracers, samples, types
 from warp_gi.pipeline import TERMS, Pipeline
 from warp_gi.scene.baked import BakedScene
-from warp_gi.scene.camera import Camera, CameraPath
+from warp_gi.scene.camera import Camera, CameraPath, frame_time
 from warp_gi.scene.scene import Scene
 from warp_gi.sequence.state import Dependence, state_arrays, with_arrays
 from warp_gi.techniques.paths.estimators import BsdfPaths, PowerLights, sky_probability
@@ -355,6 +355,7 @@ class FrameScheduler:
         A frame that an exception interrupts leaves nothing behind: what is rendered next is as if it had not begun.
         """
         self.scene.check_unchanged()
+        self.scene.update_sky(frame_time(self.camera, index))
         self.bake()
         if previous_index is None:
             previous_index = max(index - 1, 0)
@@ -412,14 +413,16 @@ class FrameScheduler:
     def dependence(self, frames: Iterable[int] | None = None, sky_changes: bool = False) -> Dependence:
         """Return how ``frames`` (None: every one of the camera's path) depend on those rendered before them.
 
-        ``sky_changes`` says that the scene gets another environment on the way.
+        ``sky_changes`` says that the scene gets another environment on the way, beside one that is a function of time.
         """
         self.bake()
         if frames is None:
             frames = range(self.camera.frame_count if isinstance(self.camera, CameraPath) else 4)
         views = [(index, self._camera_at(index)) for index in frames]
         depends = {
-            term: estimator.depends_on_past(self.scene, Ahead(self._states[term], views, sky_changes))
+            term: estimator.depends_on_past(
+                self.scene, Ahead(self._states[term], views, sky_changes or self.scene.is_sky_animated)
+            )
             for term, estimator in self._estimators.items()
         }
         on_past = [term for term in depends if depends[term]]
@@ -527,78 +530,6 @@ class FrameScheduler:
                 estimator.trace(frame, states[term])
         with frame.stage("paths"):
             frame.launch_paths()
-
-
-def render(
-    scene: Scene | Bake,
-    camera: Camera | CameraPath,
-    pipeline: Pipeline | None = None,
-    frames: Iterable[int] | None = None,
-    device: str = "cpu",
-    seed: int = 0,
-    skip: Container[int] = (),
-    progress: Callable[[str, float], None] | None = None,
-    bakes: Iterable[Bake] = (),
-) -> Iterator[Frame]:
-    """Yield the frames of a sequence.
-
-    Args:
-        scene: What is rendered; or a Bake that can be rendered without its scene, by the preset "probe_view".
-        camera: A Camera (one frame) or a CameraPath.
-        pipeline: The estimators; None is the preset "path".
-        frames: Frame numbers in order; None is every frame of the path.
-        device: "cpu", "cuda", "cuda:1".
-        seed: Every random number follows from it, the frame, the pixel and the sample.
-        skip: Frames that need not be rendered, because they exist already. What depends on frames before
-            (``FrameScheduler.dependence``) does not see them.
-        progress: Called with (stage, share done in [0, 1]).
-        bakes: Bakes made before (``gi.bake``, ``gi.load_bake``), each for the estimator that it names.
-
-    Raises OptionError for a device that is not there, a negative frame or seed, BakeError for a bake of another
-    scene or other settings, SceneError for a scene that was edited so that pictures would not show it.
-    """
-    if frames is None:
-        frames = range(camera.frame_count if isinstance(camera, CameraPath) else 1)
-    frames = list(frames)
-    if any(index < 0 for index in frames):
-        raise OptionError(f"frame numbers must be 0 or above, got {min(frames)}")
-    scheduler = FrameScheduler(scene, camera, pipeline or Pipeline(), device, seed, progress, bakes)
-    for position, index in enumerate(frames):
-        if index not in skip:
-            yield scheduler.frame(index, frames[position - 1] if position else None)
-
-
-def bake(
-    scene: Scene,
-    estimator: Estimator,
-    device: str = "cpu",
-    seed: int = 0,
-    camera_path: Camera | CameraPath | None = None,
-    progress: Callable[[str, float], None] | None = None,
-) -> Bake:
-    """Return what an estimator can know of a scene before the first frame, to be saved and used again.
-
-    Args:
-        scene: What will be rendered.
-        estimator: For example ``gi.VisibilityField(cell_size=0.5)``.
-        device: "cpu", "cuda", "cuda:1".
-        seed: Every random number follows from it.
-        camera_path: From where the scene will be seen, for estimators that bake no more than that; None is everywhere.
-        progress: Called with (stage, share done in [0, 1]).
-
-    Raises OptionError for a device that is not there, or an estimator that has nothing to bake, SceneError for a
-    scene that was edited after it was built.
-    """
-    told = (lambda share: progress("bake", share)) if progress else None
-    with scene.lock:
-        scene.check_unchanged()
-        scene.update(0.0, None, device)
-        result = estimator.bake(scene, device, seed, told, camera_path)
-    if result is None:
-        raise OptionError(
-            f"{type(estimator).__name__} with these settings has nothing to bake; render with it as it is"
-        )
-    return result
 
 
 def _fitting(pipeline: Pipeline, bake: Bake) -> Pipeline:

@@ -15,8 +15,9 @@ import pytest
 import trimesh
 
 from warp_gi.cli import main as cli
+from warp_gi.cli.interrupts import stoppable
 from warp_gi.cli.options import value_given
-from warp_gi.cli.render import Render, parse, stoppable
+from warp_gi.cli.render import Render, parse
 from warp_gi.cli.report import LOG_WIDTH, Reporter, print_table
 from warp_gi.sequence import frames as sequence
 from warp_gi.sequence.preview import write_png
