@@ -137,7 +137,11 @@ class Plan:
         """Return in words why frame ``index`` is rendered; "" for one that is kept, or was not asked for."""
         if index not in self.frames:
             return ""
-        return self.problems.get(index) or self.restart or "a frame before it is rendered again"
+        if index in self.problems or self.restart or not self.problems:
+            return self.problems.get(index) or self.restart or "files that are there are not to be kept"
+        numbers = [shot.index for shot in self.shots]
+        is_after = numbers.index(index) > numbers.index(next(iter(self.problems)))
+        return "a frame before it is rendered again" if is_after else "the saved state is of a frame before it"
 
 
 def shots_of(camera: Camera | CameraPath, frames: Sequence[int], pattern: str | Path) -> list[Shot]:

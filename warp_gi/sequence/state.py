@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
@@ -25,6 +25,12 @@ class Dependence:
     """Terms whose estimator makes them depend, and "denoiser"."""
     unsaved: tuple[str, ...]
     """Those among them whose state no file keeps."""
+
+    @property
+    def kind(self) -> Literal["independent", "saved", "unsaved"]:
+        """How a sequence can be parted: "independent" frames are the same alone and in any order; "saved" ones go on
+        from a state file; "unsaved" ones only from the first frame."""
+        return "unsaved" if self.unsaved else "saved" if self.on_past else "independent"
 
     @property
     def is_saved(self) -> bool:
