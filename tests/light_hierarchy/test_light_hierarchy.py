@@ -149,13 +149,13 @@ def zoo():
         lights.append(PunctualLight(kind, tuple(random.uniform(0, 3, 3)), tuple(position), tuple(direction)))
         lights[-1] = replace(lights[-1], inner_cone=inner, outer_cone=outer)
     scene = Scene([Node("lights", meshes)], lights)
-    return scene, scene.data("cpu"), emitter_bounds(scene, scene.data("cpu"))
+    return scene, scene.data("cpu"), emitter_bounds(scene, "cpu")
 
 
 @cache
 def warehouse():
     scene = warp_gi.builtin_scene("warehouse")
-    return scene, scene.data("cpu"), emitter_bounds(scene, scene.data("cpu"))
+    return scene, scene.data("cpu"), emitter_bounds(scene, "cpu")
 
 
 def light_corners(data):

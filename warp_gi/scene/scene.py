@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from warp_gi.color import SRGB_TO_LINEAR
 from warp_gi.errors import SceneError, unknown_name
 from warp_gi.forks import Guard
 from warp_gi.kernels import types
@@ -291,6 +292,12 @@ class Scene:
                     self._edits.in_use()
             return self._devices[device.alias].data
 
+    def placed_emitters(self, device: str | wp.Device | None = None) -> emitters.PlacedEmitters:
+        """Return where the emitters of ``data(device)`` are, from the copy on the host: nothing is downloaded."""
+        with self.lock:
+            self.data(device)
+            return self._devices[_device(device).alias].placed_emitters()
+
     def check_unchanged(self) -> None:
         """Raise SceneError if something was edited that pictures would not show: one line that says what, and the cure.
 
@@ -354,10 +361,12 @@ class _DeviceScene:
         data.geometry.materials = self._array(flat.materials, wp.int32)
         data.geometry.objects = self._array(flat.objects, wp.int32)
         data.geometry.emitters = self._array(emitter_of, wp.int32)
-        data.materials = self._array(textures.material_table(scene.materials, images), types.Material)
+        materials = textures.material_table(scene.materials, images)
+        self.two_sided = materials["double_sided"][flat.materials[scene._emissive]] != 0
+        data.materials = self._array(materials, types.Material)
         data.textures = self._array(texture_rows, types.Texture)
         data.texels = self._array(texels, wp.uint32)
-        data.srgb_to_linear = self._array(textures.SRGB_TO_LINEAR.copy(), wp.float32)
+        data.srgb_to_linear = self._array(SRGB_TO_LINEAR.copy(), wp.float32)
         data.emitters.count = len(self.emitters)
         data.emitters.emitters = self._array(self.emitters, types.Emitter)
         data.emitters.alias = wp.empty(0, dtype=types.AliasBucket, device=device)
@@ -387,6 +396,11 @@ class _DeviceScene:
 
     def _array(self, values: np.ndarray, dtype: Any) -> wp.array:
         return on_device(values, dtype, self.device)
+
+    def placed_emitters(self) -> emitters.PlacedEmitters:
+        triangles = self.scene._emissive
+        corners = self.flat.points[self.flat.indices[triangles]].astype(np.float64)
+        return emitters.PlacedEmitters(self.emitters.copy(), corners, self.two_sided)
 
     def set_environment(self, environment: Environment | None) -> None:
         self.data.environment = types.Environment() if environment is None else environment.data(self.device)
