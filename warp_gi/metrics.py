@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from warp_gi.color import LUMINANCE, decode_srgb
 from warp_gi.errors import OptionError, one_line
-from warp_gi.sequence.preview import decode_srgb
 
 RELATIVE_EPSILON = 1e-2
 PIXELS_PER_DEGREE = 67.02064
@@ -100,7 +100,7 @@ def _exposure_range(reference: np.ndarray) -> tuple[float, float]:
     goal = 0.85
     a, b, c = _A - goal * _D, _B - goal * _E, -goal * _F
     x = (-b + math.sqrt(b * b - 4 * a * c)) / (2 * a)
-    luminance = np.maximum(reference, 0) @ np.array([0.2126, 0.7152, 0.0722])
+    luminance = np.maximum(reference, 0) @ LUMINANCE
     if not luminance.max() > 0:
         return 0.0, 0.0
     median = np.median(luminance) or np.median(luminance[luminance > 0])

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from warp_gi.color import SRGB_TO_LINEAR
 from warp_gi.errors import SceneError
 from warp_gi.kernels import types
 from warp_gi.launch import on_device
@@ -50,10 +51,12 @@ class DeviceScene:
         data.geometry.materials = self._array(flat.materials, wp.int32)
         data.geometry.objects = self._array(flat.objects, wp.int32)
         data.geometry.emitters = self._array(emitter_of, wp.int32)
-        data.materials = self._array(textures.material_table(scene.materials, images), types.Material)
+        materials = textures.material_table(scene.materials, images)
+        self.two_sided = materials["double_sided"][flat.materials[scene._emissive]] != 0
+        data.materials = self._array(materials, types.Material)
         data.textures = self._array(texture_rows, types.Texture)
         data.texels = self._array(texels, wp.uint32)
-        data.srgb_to_linear = self._array(textures.SRGB_TO_LINEAR.copy(), wp.float32)
+        data.srgb_to_linear = self._array(SRGB_TO_LINEAR.copy(), wp.float32)
         data.emitters.count = len(self.emitters)
         data.emitters.emitters = self._array(self.emitters, types.Emitter)
         data.emitters.alias = wp.empty(0, dtype=types.AliasBucket, device=device)
@@ -83,6 +86,11 @@ class DeviceScene:
 
     def _array(self, values: np.ndarray, dtype: Any) -> wp.array:
         return on_device(values, dtype, self.device)
+
+    def placed_emitters(self) -> emitters.PlacedEmitters:
+        triangles = self.scene._emissive
+        corners = self.flat.points[self.flat.indices[triangles]].astype(np.float64)
+        return emitters.PlacedEmitters(self.emitters.copy(), corners, self.two_sided)
 
     def set_environment(self, environment: Environment | None) -> None:
         self.data.environment = types.Environment() if environment is None else environment.data(self.device)

@@ -24,6 +24,7 @@ import numpy as np
 import warp as wp
 
 from warp_gi.alias import AliasTable
+from warp_gi.color import LUMINANCE, decode_srgb
 from warp_gi.errors import SceneError, one_line
 from warp_gi.kernels import types
 from warp_gi.launch import get_device, on_device
@@ -34,7 +35,6 @@ from warp_gi.scene.watching import Watch
 
 __all__ = ["Environment", "SunSky", "as_environment"]
 
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 LARGEST_HEIGHT = 4096  # texel coordinates must be exact in float32 with bits left to interpolate
 NEGLIGIBLE_NEGATIVE = 1e-4  # of the sum of all pixels
 
@@ -296,5 +296,5 @@ def _read_image(path: Path) -> np.ndarray:
         colors = [0, 0, 0]
     pixels = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)[..., colors]
     if spec.format.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE):
-        pixels = np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4).astype(np.float32)
+        pixels = decode_srgb(pixels)
     return np.ascontiguousarray(pixels)

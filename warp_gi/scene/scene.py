@@ -327,6 +327,12 @@ class Scene:
                     self._edits.in_use()
             return self._devices[device.alias].data
 
+    def placed_emitters(self, device: str | wp.Device | None = None) -> emitters.PlacedEmitters:
+        """Return where the emitters of ``data(device)`` are, from the copy on the host: nothing is downloaded."""
+        with self.lock:
+            self.data(device)
+            return self._devices[_device(device).alias].placed_emitters()
+
     def check_unchanged(self) -> None:
         """Raise SceneError if something was edited that pictures would not show: one line that says what, and the cure.
 

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from warp_gi.alias import AliasTable
+from warp_gi.color import LUMINANCE
 from warp_gi.errors import OptionError
 from warp_gi.estimator import Estimator
 from warp_gi.kernels import path_trace
@@ -116,6 +117,6 @@ def sky_probability(scene: Any) -> float:
         return 0.0
     if scene.emitter_count == 0:
         return 1.0
-    sky = 4.0 * math.pi**2 * scene.radius**2 * float(environment.mean_radiance @ (0.2126, 0.7152, 0.0722))
+    sky = 4.0 * math.pi**2 * scene.radius**2 * float(environment.mean_radiance @ LUMINANCE)
     emitters = float(scene.emitter_powers().sum())
     return min(max(sky / max(sky + emitters, 1e-30), 0.2), 0.8)
