@@ -42,15 +42,6 @@ def lat_long_encode(direction: wp.vec3) -> wp.vec2:
     return wp.vec2(u - wp.floor(u), v)
 
 
-# Inverse of lat_long_encode.
-@wp.func
-def lat_long_decode(uv: wp.vec2) -> wp.vec3:
-    phi = uv[0] * TWO_PI
-    theta = uv[1] * PI
-    sin_theta = wp.sin(theta)
-    return wp.vec3(sin_theta * wp.sin(phi), wp.cos(theta), -sin_theta * wp.cos(phi))
-
-
 # Four nodes of the map around a point, in units of its texels, and where between them it is.
 @wp.struct
 class Patch:

@@ -167,20 +167,6 @@ def quadtree_children(tree: wp.vec4ui, k: wp.int32) -> wp.int32:
     return 4 * (quadtree_rank(tree, k) + 1)
 
 
-# Whether node k is an inner node all of whose children are leaves.
-@wp.func_native(
-    _TREE_CODE
-    + """
-    const Tree t(tree);
-    if (!t.bit(k))
-        return 0;
-    const int child = 4 * (t.rank(k) + 1);
-    return ((child < 64 ? t.low >> child : t.high >> (child - 64)) & 15) == 0;
-"""
-)
-def quadtree_is_twig(tree: wp.vec4ui, k: wp.int32) -> wp.int32: ...
-
-
 # First node of a level, of edge 2^-level, or `bits` where the tree ends above it; the root alone is level 0.
 # Levels follow each other in the bits, so leaves that may be split are those before level QUADTREE_LEVELS.
 @wp.func
@@ -263,18 +249,6 @@ def quadtree_locate(tree: wp.vec4ui, bits: wp.int32, uv: wp.vec2) -> QuadtreeCel
     cell.size = level_size(level)
     cell.x = wp.float32(x >> shift) * cell.size
     cell.y = wp.float32(y >> shift) * cell.size
-    return cell
-
-
-# Where a node (inner or leaf) lies.
-@wp.func
-def quadtree_bounds(tree: wp.vec4ui, bits: wp.int32, node: wp.int32) -> QuadtreeCell:
-    place = quadtree_ascend(tree, node)
-    cell = QuadtreeCell()
-    cell.node = node
-    cell.size = level_size(place[2])
-    cell.x = wp.float32(place[0]) * cell.size
-    cell.y = wp.float32(place[1]) * cell.size
     return cell
 
 

@@ -68,14 +68,14 @@ def differing(found: list[dict[str, np.ndarray]], wanted: list[dict[str, np.ndar
 def run_case(file: str, case: str, *more: str, seconds: float = 90.0) -> None:
     """Run a case of a test file in a process of its own; one that hangs is ended, with all it started, and fails."""
     command = [sys.executable, file, case, *more]
-    environment = os.environ | {"PYTHONPATH": os.path.dirname(__file__)}
+    tools = os.pathsep.join([os.path.dirname(__file__), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
     process = subprocess.Popen(
         command,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
         start_new_session=True,
-        env=environment,
+        env={**os.environ, "PYTHONPATH": tools},
     )
     try:
         printed, _ = process.communicate(timeout=seconds)

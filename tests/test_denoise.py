@@ -397,7 +397,7 @@ def test_bad_settings_are_one_line(make, words):
 
 def test_files_and_flags(tmp_path):
     from warp_gi.cli import main as cli
-    from warp_gi.cli.render import pipeline_named
+    from warp_gi.cli.pipelines import pipeline_named
 
     assert pipeline_named("direct,denoise=SpatioTemporal").denoise == SpatioTemporal()
     assert pipeline_named("path,denoise=none").denoise is None

@@ -59,7 +59,8 @@ def test_flip_agrees_with_nvidia(hdr):
 
 def test_flip_of_coded_bytes_is_ldr():
     image, reference = (np.clip(x, 0, 1) for x in _noisy_pair())
-    from warp_gi.sequence.preview import decode_srgb, encode_srgb, to_bytes
+    from warp_gi.color import decode_srgb, encode_srgb
+    from warp_gi.sequence.preview import to_bytes
 
     bytes_a, bytes_b = to_bytes(encode_srgb(image)), to_bytes(encode_srgb(reference))
     linear = metrics.flip(decode_srgb(bytes_a / 255), decode_srgb(bytes_b / 255), hdr=False)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warp_gi.errors import OptionError, unknown_name
+from warp_gi.errors import OptionError, one_line, unknown_name
 from warp_gi.kernels import denoise
 from warp_gi.stateful import Ahead, Stateful
 
@@ -218,7 +218,7 @@ class Oidn(Denoiser):
             return importlib.import_module("pyoidn")
         except (ImportError, OSError) as error:
             message = f"Open Image Denoise is not here ({error}); pip install 'warp-gi[denoise]'"
-            raise OptionError(" ".join(message.split())) from error
+            raise OptionError(one_line(message)) from error
 
     def apply(self, frame: Frame, state: Any) -> Any:
         """Fill ``frame["beauty"]``: emission as it is, and all other light denoised."""

@@ -23,6 +23,11 @@ class BakeError(GiError):
     """A bake file is damaged, foreign, or of another scene or other settings."""
 
 
+def one_line(message: object, otherwise: str = "") -> str:
+    """Return a message with each run of spaces and line ends as one space; ``otherwise`` if nothing is left."""
+    return " ".join(str(message).split()) or otherwise
+
+
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> OptionError:
     """Return an error for an unknown ``name`` that lists the known ones and the nearest match."""
     known = sorted(known)

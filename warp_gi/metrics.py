@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from warp_gi.errors import OptionError
-from warp_gi.sequence.preview import decode_srgb
+from warp_gi.color import LUMINANCE, decode_srgb
+from warp_gi.errors import OptionError, one_line
 
 RELATIVE_EPSILON = 1e-2
 PIXELS_PER_DEGREE = 67.02064
@@ -82,7 +82,7 @@ def _ldr_flip(a: np.ndarray, r: np.ndarray, pixels_per_degree: float) -> np.ndar
     a, r = (oiio.ImageBuf(np.ascontiguousarray(np.clip(x, 0, 1), np.float32)) for x in (a, r))
     result = oiio.ImageBufAlgo.FLIP_diff(r, a, hdr=0, ppd=pixels_per_degree)
     if result.has_error:
-        raise OptionError(f"FLIP: {' '.join(result.geterror().split())}")
+        raise OptionError(f"FLIP: {one_line(result.geterror())}")
     return np.ascontiguousarray(result.get_pixels(oiio.FLOAT)[:, :, 0])
 
 
@@ -100,7 +100,7 @@ def _exposure_range(reference: np.ndarray) -> tuple[float, float]:
     goal = 0.85
     a, b, c = _A - goal * _D, _B - goal * _E, -goal * _F
     x = (-b + math.sqrt(b * b - 4 * a * c)) / (2 * a)
-    luminance = np.maximum(reference, 0) @ np.array([0.2126, 0.7152, 0.0722])
+    luminance = np.maximum(reference, 0) @ LUMINANCE
     if not luminance.max() > 0:
         return 0.0, 0.0
     median = np.median(luminance) or np.median(luminance[luminance > 0])

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import warp as wp
 
+from warp_gi.color import LUMINANCE
 from warp_gi.kernels import path_samplers, path_trace
 
 if TYPE_CHECKING:
@@ -132,6 +133,6 @@ def sky_probability(scene: Scene | BakedScene) -> float:
         return 0.0
     if scene.emitter_count == 0:
         return 1.0
-    sky = 4.0 * math.pi**2 * scene.radius**2 * float(environment.mean_radiance @ (0.2126, 0.7152, 0.0722))
+    sky = 4.0 * math.pi**2 * scene.radius**2 * float(environment.mean_radiance @ LUMINANCE)
     emitters = float(scene.emitter_powers().sum())
     return min(max(sky / max(sky + emitters, 1e-30), 0.2), 0.8)

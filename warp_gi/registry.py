@@ -90,9 +90,15 @@ def technique_named(name: str) -> Technique:
     raise unknown_name("technique", name, [one.name for one in techniques().values()])
 
 
-def bake_tools() -> dict[str, str]:
-    """Return the modules of techniques that ``warp-gi bake`` can bake, by long name."""
-    return {one.name: f"{folder_of(one)}.{one.bake_tool}" for one in techniques().values() if one.bake_tool}
+def bakeable() -> dict[str, Technique]:
+    """Return the techniques that ``warp-gi bake`` can bake, by long name."""
+    return {one.name: one for one in techniques().values() if one.bake_tool}
+
+
+def bake_tool(name: str) -> Any:
+    """Return the ``BakeTool`` of a technique; raises OptionError for an unknown name, KeyError if it has none."""
+    one = bakeable()[technique_named(name).name]
+    return importlib.import_module(f"{folder_of(one)}.{one.bake_tool}").TOOL
 
 
 def presets() -> dict[str, Mapping[str, Any]]:

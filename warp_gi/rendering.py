@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
-from warp_gi.baking import Bake
 from warp_gi.errors import OptionError
-from warp_gi.estimator import Estimator
-from warp_gi.frame import Frame
 from warp_gi.pipeline import Pipeline
 from warp_gi.scene.camera import Camera, CameraPath
-from warp_gi.scene.scene import Scene
 from warp_gi.scheduler import FrameScheduler
+from warp_gi.sequence.resume import Output, Plan, SequenceRun, shots_of
+
+if TYPE_CHECKING:
+    from warp_gi.baking import Bake
+    from warp_gi.estimator import Estimator
+    from warp_gi.scene.scene import Scene
+    from warp_gi.scheduler import Frame
+
+Progress = Callable[[str, float], None]
 
 
 def render(
@@ -22,10 +29,22 @@ def render(
     device: str = "cpu",
     seed: int = 0,
     skip: Container[int] = (),
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
     bakes: Iterable[Bake] = (),
+    *,
+    output: str | Path | None = None,
+    resume: bool = False,
+    precision: Literal["half", "float"] = "half",
+    preview: bool = False,
+    exposure: float = 0.0,
 ) -> Iterator[Frame]:
-    """Yield the frames of a sequence.
+    """Yield the frames of a sequence, and write them to files if there is an ``output``.
+
+    A file is there, whole, before its frame is yielded. Without ``resume`` all frames are rendered, whatever files
+    there are. With it, frames whose files are whole and were made with just these settings are neither rendered nor
+    yielded: ``gi.read_frame`` reads them, and ``gi.plan_sequence`` tells beforehand which they are. Where frames depend
+    on those before, what is learnt is saved beside them after each frame (NAME.state.safetensors), and a resumed
+    sequence goes on from there to the same bits; if it cannot, all its frames are rendered again.
 
     Args:
         scene: What is rendered; or a Bake that can be rendered without its scene, by the preset "probe_view".
@@ -38,19 +57,64 @@ def render(
             (``FrameScheduler.dependence``) does not see them.
         progress: Called with (stage, share done in [0, 1]).
         bakes: Bakes made before (``gi.bake``, ``gi.load_bake``), each for the estimator that it names.
+        output: Where frames go, as "out/shot.####.exr": #### becomes the frame's number. EXR files have every buffer
+            as a named layer, and metadata; PNG files are tone-mapped pictures, and cannot be resumed. None writes none.
+        resume: Keep the files that are there, and render what is missing, torn, or of other settings.
+        precision: Storage of colours and normals in EXR files: "half" or "float".
+        preview: Write a tone-mapped PNG beside each EXR file.
+        exposure: Exposure of PNG files in stops.
 
-    Raises OptionError for a device that is not there, a negative frame or seed, BakeError for a bake of another
-    scene or other settings, SceneError for a scene that was edited so that pictures would not show it.
+    Raises OptionError for a device that is not there, a negative frame or seed, files that frames cannot be, several
+    frames for one file; BakeError for a bake of another scene or other settings; SceneError for a scene that was
+    edited so that pictures would not show it; OSError for files that cannot be written.
     """
-    if frames is None:
-        frames = range(camera.frame_count if isinstance(camera, CameraPath) else 1)
-    frames = list(frames)
-    if any(index < 0 for index in frames):
-        raise OptionError(f"frame numbers must be 0 or above, got {min(frames)}")
+    if output is None and (resume or preview or exposure or precision != "half"):
+        raise OptionError('resume, precision, preview and exposure are of files; give output="out/shot.####.exr" too')
+    wanted = _frame_numbers(camera, frames)
     scheduler = FrameScheduler(scene, camera, pipeline or Pipeline(), device, seed, progress, bakes)
-    for position, index in enumerate(frames):
-        if index not in skip:
-            yield scheduler.frame(index, frames[position - 1] if position else None)
+    if output is None:
+        for position, index in enumerate(wanted):
+            if index not in skip:
+                yield scheduler.frame(index, wanted[position - 1] if position else None)
+        return
+    files = Output(Path(output), precision, preview, exposure)
+    shots = [shot for shot in shots_of(camera, wanted, files.pattern) if shot.index not in skip]
+    if not shots:
+        return
+    run = SequenceRun(scheduler, shots, files)
+    plan = run.plan(resume)
+    run.prepare(plan)
+    for shot in plan.todo:
+        frame = run.render(shot)
+        run.save_state(shot, frame)
+        yield frame
+        del frame  # before there is a next one
+
+
+def plan_sequence(
+    scene: Scene | Bake,
+    camera: Camera | CameraPath,
+    pipeline: Pipeline | None = None,
+    frames: Iterable[int] | None = None,
+    device: str = "cpu",
+    seed: int = 0,
+    progress: Progress | None = None,
+    bakes: Iterable[Bake] = (),
+    *,
+    output: str | Path,
+    precision: Literal["half", "float"] = "half",
+) -> Plan:
+    """Return what ``render`` with these arguments and ``resume=True`` would render, and why; nothing is written.
+
+    ``plan.frames`` are the numbers of the frames to render, ``plan.missing`` of those without a file, and
+    ``plan.reason(index)`` says in words why a frame is rendered. What estimators need is baked for that, as a file
+    tells with which bake it was made: give ``bakes`` to do so once. Arguments and errors are those of ``render``.
+    """
+    wanted = _frame_numbers(camera, frames)
+    scheduler = FrameScheduler(scene, camera, pipeline or Pipeline(), device, seed, progress, bakes)
+    files = Output(Path(output), precision)
+    shots = shots_of(camera, wanted, files.pattern)
+    return SequenceRun(scheduler, shots, files).plan() if shots else Plan((), ())
 
 
 def bake(
@@ -58,29 +122,46 @@ def bake(
     estimator: Estimator,
     device: str = "cpu",
     seed: int = 0,
+    camera: Camera | CameraPath | None = None,
+    progress: Progress | None = None,
+    *,
     camera_path: Camera | CameraPath | None = None,
-    progress: Callable[[str, float], None] | None = None,
 ) -> Bake:
     """Return what an estimator can know of a scene before the first frame, to be saved and used again.
 
     Args:
-        scene: What will be rendered.
+        scene: What will be rendered. It is baked as it is at time 0, its sky too.
         estimator: For example ``gi.VisibilityField(cell_size=0.5)``.
         device: "cpu", "cuda", "cuda:1".
         seed: Every random number follows from it.
-        camera_path: From where the scene will be seen, for estimators that bake no more than that; None is everywhere.
+        camera: Where the scene will be seen from, for estimators that bake no more than that; None is everywhere.
         progress: Called with (stage, share done in [0, 1]).
+        camera_path: Another name of ``camera``.
 
-    Raises OptionError for a device that is not there, or an estimator that has nothing to bake, SceneError for a
-    scene that was edited after it was built.
+    Raises OptionError for a device that is not there, an estimator that has nothing to bake, or both ``camera`` and
+    ``camera_path``; SceneError for a scene that was edited after it was built.
     """
+    if camera is not None and camera_path is not None:
+        raise OptionError("camera and camera_path are two names of one argument; give camera")
+    camera = camera_path if camera is None else camera
     told = (lambda share: progress("bake", share)) if progress else None
     with scene.lock:
         scene.check_unchanged()
+        scene.update_sky(0.0)
         scene.update(0.0, None, device)
-        result = estimator.bake(scene, device, seed, told, camera_path)
+        result = estimator.bake(scene, device, seed, told, camera)
     if result is None:
         raise OptionError(
             f"{type(estimator).__name__} with these settings has nothing to bake; render with it as it is"
         )
     return result
+
+
+def _frame_numbers(camera: Camera | CameraPath, frames: Iterable[int] | None) -> list[int]:
+    """Return the frames to render, None being every one of the camera's; raises OptionError for negative ones."""
+    if frames is None:
+        frames = range(camera.frame_count if isinstance(camera, CameraPath) else 1)
+    frames = list(frames)
+    if any(index < 0 for index in frames):
+        raise OptionError(f"frame numbers must be 0 or above, got {min(frames)}")
+    return frames

@@ -20,7 +20,7 @@ from warp_gi.frame import Frame
 from warp_gi.kernels import compose, types
 from warp_gi.pipeline import DENOISER, Pipeline
 from warp_gi.scene.baked import BakedScene
-from warp_gi.scene.camera import Camera, CameraPath
+from warp_gi.scene.camera import Camera, CameraPath, frame_time
 from warp_gi.scene.scene import Scene
 from warp_gi.sequence.state import Dependence, state_arrays, with_arrays
 from warp_gi.stateful import Ahead, Stateful
@@ -173,6 +173,7 @@ class FrameScheduler:
         A frame that an exception interrupts leaves nothing behind: what is rendered next is as if it had not begun.
         """
         self.scene.check_unchanged()
+        self.scene.update_sky(frame_time(self.camera, index))
         self.bake()
         if previous_index is None:
             previous_index = max(index - 1, 0)
@@ -252,13 +253,15 @@ class FrameScheduler:
     def dependence(self, frames: Iterable[int] | None = None, sky_changes: bool = False) -> Dependence:
         """Return how ``frames`` (None: every one of the camera's path) depend on those rendered before them.
 
-        ``sky_changes`` says that the scene gets another environment on the way. It is ``Pipeline.dependence`` with
+        ``sky_changes`` says that the scene gets another environment on the way, beside one that is a function of time.
+        It is ``Pipeline.dependence`` with
         what this scheduler knows of the frames to come.
         """
         self.bake()
         if frames is None:
             frames = range(self.camera.frame_count if isinstance(self.camera, CameraPath) else 4)
         views = [(index, self._camera_at(index)) for index in frames]
+        sky_changes = sky_changes or self.scene.is_sky_animated
         return self.pipeline.dependence(self.scene, lambda place: Ahead(self._states[place], views, sky_changes))
 
     def save_state(self, path: str | Path, lineage: str = "") -> Path:

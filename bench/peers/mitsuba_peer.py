@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warp_gi import launch
+from warp_gi.color import decode_srgb
 
 if TYPE_CHECKING:
     import warp_gi as gi
@@ -293,7 +294,7 @@ def _color(mi: Any, factor: Any, image: gi.Texture | None) -> dict[str, Any]:
     if image is None:
         return _rgb(factor)
     coded = image.pixels[..., :3].astype(np.float32) / 255.0
-    linear = np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4) if image.srgb else coded
+    linear = decode_srgb(coded) if image.srgb else coded
     return _bitmap(mi, linear * np.asarray(factor, dtype=np.float32), image)
 
 

@@ -21,7 +21,7 @@ from warp_gi.bench.suites.scaling import suite as scaling
 from warp_gi.bench.suites.scaling import triangles as scaling_triangles
 from warp_gi.bench.suites.scaling.fits import Growth, words
 from warp_gi.bench.suites.scaling.mesh import CROWD_VIEW, HALL, LAMP_AREA, SIDE, crowd, lamp_hall
-from warp_gi.scene.textures import LUMINANCE
+from warp_gi.color import LUMINANCE
 
 
 def table(rows: list[dict], name: str) -> list[dict]:

@@ -22,7 +22,8 @@ from warp_gi.bench.report import suite_plots as report_plots
 from warp_gi.bench.report import tables as report_tables
 from warp_gi.bench.report.plots import Plot, svg
 from warp_gi.cli import main as cli
-from warp_gi.sequence.preview import decode_srgb, magma, tone_map
+from warp_gi.color import decode_srgb
+from warp_gi.sequence.preview import magma, tone_map
 
 HEIGHT, WIDTH = 24, 40
 WRONG = (30, 6)

@@ -15,8 +15,9 @@ import pytest
 import trimesh
 
 from warp_gi.cli import main as cli
+from warp_gi.cli.interrupts import stoppable
 from warp_gi.cli.options import value_given
-from warp_gi.cli.render import Render, parse, stoppable
+from warp_gi.cli.render import Render, parse
 from warp_gi.cli.report import LOG_WIDTH, Reporter, print_table
 from warp_gi.sequence import frames as sequence
 from warp_gi.sequence.preview import write_png
@@ -130,7 +131,7 @@ def test_killed_runs_resume_to_the_same_files(unbroken, tmp_path, extra):
         process.kill()
         assert process.wait() == -signal.SIGKILL
         for path in broken.glob("a.*.exr"):
-            assert sequence.is_whole(path), path
+            assert sequence.why_not_whole(path) is None, path
     for folder in (broken, whole):
         process = _start(folder, "--resume", "--preview", *extra)
         assert process.communicate(timeout=200) == ("", "") and process.returncode == 0
@@ -184,7 +185,7 @@ def test_ctrl_c_keeps_what_is_done(unbroken, tmp_path):
     assert err == "warp-gi: interrupted: finished frames are kept, --resume renders the others\n"
     files = list(tmp_path.iterdir())
     assert 1 <= len(files) < 8
-    assert all(sequence.is_whole(path) for path in files)
+    assert all(sequence.why_not_whole(path) is None for path in files)
 
 
 def test_a_swallowed_ctrl_c_is_remembered(capfd):

@@ -17,7 +17,7 @@ from warp_gi.sequence.preview import tone_map
 from warp_gi.techniques.light_field import export, pictures
 from warp_gi.techniques.light_field import ray as rays
 from warp_gi.techniques.shared.legends import exposure_of
-from warp_gi.techniques.shared.octahedral_atlas import encode
+from warp_gi.techniques.shared.octahedral import encode
 
 wp.set_module_options({"enable_backward": False})
 

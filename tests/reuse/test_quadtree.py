@@ -33,7 +33,6 @@ def ask_nodes(
     bits: wp.int32,
     trees: wp.array(dtype=wp.vec4ui),
     ranks: wp.array2d(dtype=wp.uint8),
-    twigs: wp.array2d(dtype=wp.uint8),
     selected: wp.array2d(dtype=wp.uint8),
     places: wp.array2d(dtype=wp.uint32),
 ):
@@ -42,11 +41,10 @@ def ask_nodes(
     inner = bits / 4 - 1
     for k in range(bits):
         ranks[i, k] = wp.uint8(quadtree.quadtree_rank(tree, k))
-        twigs[i, k] = wp.uint8(quadtree.quadtree_is_twig(tree, k))
-        cell = quadtree.quadtree_bounds(tree, bits, k)
+        place = quadtree.quadtree_ascend(tree, k)
         # 2^level + column and 2^level + row, which say the level too
-        column = wp.uint32((1.0 + cell.x) / cell.size)
-        row = wp.uint32((1.0 + cell.y) / cell.size)
+        column = wp.uint32((1 << place[2]) + place[0])
+        row = wp.uint32((1 << place[2]) + place[1])
         places[i, k] = (column << wp.uint32(16)) | row
         if k < inner:
             selected[i, k] = wp.uint8(quadtree.quadtree_select1(tree, k))
@@ -61,13 +59,16 @@ def locate_leaves(first: wp.int32, bits: wp.int32, trees: wp.array(dtype=wp.vec4
     count = int(0)
     for leaf in range(quadtree.quadtree_leaf_count(bits)):
         node = quadtree.quadtree_select0(trees[i], bits, leaf)
-        cell = quadtree.quadtree_bounds(trees[i], bits, node)
-        last = cell.size - 5.9604644775390625e-8
+        place = quadtree.quadtree_ascend(trees[i], node)
+        size = 1.0 / wp.float32(1 << place[2])
+        left = wp.float32(place[0]) * size
+        low = wp.float32(place[1]) * size
+        last = size - 5.9604644775390625e-8
         for corner in range(5):
-            x = cell.x + wp.where(corner == 4, 0.5 * cell.size, wp.where((corner & 1) == 1, last, 0.0))
-            y = cell.y + wp.where(corner == 4, 0.5 * cell.size, wp.where((corner & 2) == 2, last, 0.0))
+            x = left + wp.where(corner == 4, 0.5 * size, wp.where((corner & 1) == 1, last, 0.0))
+            y = low + wp.where(corner == 4, 0.5 * size, wp.where((corner & 2) == 2, last, 0.0))
             other = quadtree.quadtree_locate(trees[i], bits, wp.vec2(x, y))
-            if other.node == node and other.x == cell.x and other.y == cell.y and other.size == cell.size:
+            if other.node == node and other.x == left and other.y == low and other.size == size:
                 count += 1
     found[i] = count
 
@@ -87,6 +88,16 @@ def halve_words(
 ):
     k = first + wp.tid()
     out[k] = quadtree.select_by_halves(words[k], i[k])
+
+
+# Whether all four children of inner node k are leaves.
+@wp.func
+def is_twig(tree: wp.vec4ui, bits: wp.int32, k: wp.int32) -> wp.bool:
+    child = quadtree.quadtree_children(tree, k)
+    for i in range(bits / 4 - 1):
+        if (quadtree.quadtree_select1(tree, i) & ~3) == child:
+            return False
+    return True
 
 
 # Migrates random leaves and writes every tree, with the nodes that were migrated to get it (none: -1).
@@ -109,7 +120,7 @@ def walk(
         inner = quadtree.quadtree_select1(now, wp.int32(b * wp.float32(bits / 4 - 1)))
         moves[i * steps + step] = wp.vec2i(-1, -1)
         if (
-            quadtree.quadtree_is_twig(now, inner) != 0
+            is_twig(now, bits, inner)
             and quadtree.quadtree_children(now, inner) != (leaf & ~3)
             and leaf < quadtree.quadtree_level_start(now, bits, quadtree.QUADTREE_LEVELS)
         ):
@@ -526,12 +537,12 @@ def level_grid(number, bits, deepest):
 
 
 def check_nodes(trees, bits):
-    """Rank, select, twigs, bounds and locate of trees [tree, 4] against the bits themselves."""
+    """Rank, select, ascend and locate of trees [tree, 4] against the bits themselves."""
     n = len(trees)
-    ranks, twigs, selected = (empty((n, bits), wp.uint8) for _ in range(3))
+    ranks, selected = (empty((n, bits), wp.uint8) for _ in range(2))
     places, found = empty((n, bits), wp.uint32), empty(n, wp.int32)
     on = on_device(trees, wp.vec4ui)
-    launch(ask_nodes, n, [bits, on, ranks, twigs, selected, places], device())
+    launch(ask_nodes, n, [bits, on, ranks, selected, places], device())
     launch(locate_leaves, n, [bits, on, found], device())
     ones = bit_matrix(trees, bits)
     before = np.cumsum(ones, axis=1, dtype=np.uint8) - ones
@@ -542,15 +553,11 @@ def check_nodes(trees, bits):
     # children of inner node j are nodes 4 j ..: what a node is, is known once its parent is
     expected = np.zeros((n, bits + 1), np.uint32)
     expected[:, bits] = 1 << 16 | 1  # the root
-    expected_twigs = np.zeros((n, bits), bool)
     rows = np.arange(n)
     for j in range(bits // 4):
         parent = np.full(n, bits) if j == 0 else inner[:, j - 1]
         for q in range(4):
             expected[:, 4 * j + q] = 2 * expected[rows, parent] + ((q & 1) << 16 | q >> 1)
-        if j:
-            expected_twigs[rows, parent] = ~ones[:, 4 * j : 4 * j + 4].any(axis=1)
-    assert np.array_equal(twigs.numpy(), expected_twigs)
     assert np.array_equal(places.numpy(), expected[:, :bits])
 
 

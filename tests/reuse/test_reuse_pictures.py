@@ -18,7 +18,7 @@ from warp_gi.launch import set_threads
 from warp_gi.sequence.preview import magma
 from warp_gi.techniques.light_field.ray import probe_color
 from warp_gi.techniques.reuse import pictures
-from warp_gi.techniques.shared.octahedral_atlas import decode
+from warp_gi.techniques.shared.octahedral import decode
 
 SIZE = (24, 16)
 PIXEL = (12, 12)

@@ -8,7 +8,7 @@ from scene_tools import GlbBuilder
 
 import warp_gi as gi
 from warp_gi.cli.inputs import scene_camera
-from warp_gi.cli.render import parse, plan
+from warp_gi.cli.render import find_shots, parse
 from warp_gi.errors import GiError, OptionError, SceneError
 from warp_gi.scene.camera import Camera, CameraKey, CameraPath
 
@@ -125,5 +125,5 @@ def test_path_from_gltf_follows_the_camera_node(tmp_path):
     with pytest.raises(OptionError, match="did you mean 'view'"):
         CameraPath.from_gltf(tmp_path / "moving.glb", name="vie")
     scene = gi.load_scene(tmp_path / "moving.glb")
-    shots = plan(parse([str(tmp_path / "moving.glb")]), scene_camera(scene, "view"))
+    shots = find_shots(parse([str(tmp_path / "moving.glb")]), scene_camera(scene, "view"))
     assert len(shots) == 25 and np.allclose(shots[12].camera.position, [1, 0, 5], atol=1e-5)

@@ -11,11 +11,12 @@ import pytest
 import warp as wp
 from scene_tools import TRIANGLE_UVS, triangle
 
+from warp_gi.color import SRGB_TO_LINEAR
 from warp_gi.errors import SceneError
 from warp_gi.kernels import types
 from warp_gi.scene.model import Keyframe, Material, Node, PunctualLight, Texture
 from warp_gi.scene.scene import Scene
-from warp_gi.scene.textures import SRGB_TO_LINEAR, box_means, linear_rgb, texture_table
+from warp_gi.scene.textures import box_means, linear_rgb, texture_table
 
 
 def checker(size: int = 4) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import warp as wp
 from scene_tools import triangle
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -124,3 +125,30 @@ def test_animating_what_is_not_there_is_an_error():
         scene.animate("twin", SLIDE)
     with pytest.raises(SceneError, match="at least one keyframe"):
         scene.animate("left", [])
+
+
+def test_emitters_are_placed_without_a_download(monkeypatch):
+    """What the host knows of lights is what the device has, to the last bit, in every pose."""
+    one, both = (Material("lamp", emission=(0.5, 2.0, 1.0), double_sided=sides) for sides in (False, True))
+    nodes = [Node("floor", [triangle()]), Node("lift", [triangle(one)]), Node("cabin", [triangle(both)], parent=1)]
+    nodes[2].parent_from_node = np.diag([0.5, 2.0, 1.0, 1.0]).astype(np.float32)
+    lights = [PunctualLight("spot", (1.0, 1.0, 1.0), (0.1, 0.2, 0.3), node=1), PunctualLight("point", (2.0, 1.0, 1.0))]
+    scene = Scene(nodes, lights)
+    scene.animate("lift", [Keyframe(0.0), Keyframe(2.0, (4.0, 1.0, 0.0), (0.0, 0.6, 0.0, 0.8))])
+    seen = []
+    for device in [device.alias for device in wp.get_devices()]:
+        for time in (0.0, 0.7, 2.0):
+            scene.update(time, device=device)
+            data = scene.data(device)
+            table, geometry = data.emitters.emitters.numpy().copy(), data.geometry
+            faces = table["triangle"][:2]
+            corners = geometry.points.numpy()[geometry.indices.numpy()[faces]].astype(np.float64)
+            sides = data.materials.numpy()["double_sided"][geometry.materials.numpy()[faces]] != 0
+            with monkeypatch.context() as patch:
+                patch.setattr(wp.array, "numpy", lambda self: pytest.fail("an array was downloaded"))
+                placed = scene.placed_emitters(device)
+            np.testing.assert_array_equal(placed.table, table)
+            np.testing.assert_array_equal(placed.corners, corners)
+            assert placed.two_sided.tolist() == sides.tolist() == [False, True]
+            seen.append(corners[0, 0, 0])
+    assert len(set(seen[:3])) == 3

@@ -18,7 +18,7 @@ from concurrency_tools import buffers, differing, frames, main, moving_room, run
 import warp_gi as gi
 from warp_gi import bvh, launch, workers
 from warp_gi.scene import geometry
-from warp_gi.scene import scene as scene_module
+from warp_gi.scene.device_scene import DeviceScene
 
 COUNT = 5000
 
@@ -287,7 +287,7 @@ def test_interrupts(case):
 
 
 @pytest.mark.parametrize(
-    "owner, name", [(geometry, "place"), (bvh.TriangleBvh, "refit"), (scene_module._DeviceScene, "_bound_emitters")]
+    "owner, name", [(geometry, "place"), (bvh.TriangleBvh, "refit"), (DeviceScene, "_bound_emitters")]
 )
 def test_an_interrupt_while_the_scene_moves(monkeypatch, owner, name):
     """Whatever was moved and whatever not, the next frame moves it all."""

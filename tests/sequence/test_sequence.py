@@ -12,7 +12,7 @@ from warp_gi.errors import OptionError, SceneError
 from warp_gi.files import remove_stale_parts, replacing
 from warp_gi.sequence import frames as sequence
 from warp_gi.sequence.exr import read_exr, write_exr
-from warp_gi.sequence.preview import decode_srgb, encode_srgb, tone_map
+from warp_gi.sequence.preview import tone_map
 
 
 def test_frame_path():
@@ -117,7 +117,7 @@ def test_equal_frames_are_equal_files(tmp_path):
 def test_every_truncation_is_noticed(tmp_path):
     whole = sequence.write_frame(make_frame(), tmp_path / "a.exr")
     data = whole.read_bytes()
-    assert sequence.is_whole(whole)
+    assert sequence.why_not_whole(whole) is None
     torn = tmp_path / "torn.exr"
     for length in [0, 1, 4, 50, *np.linspace(100, len(data) - 2, 40).astype(int), len(data) - 1]:
         torn.write_bytes(data[:length])
@@ -125,7 +125,7 @@ def test_every_truncation_is_noticed(tmp_path):
         with pytest.raises(SceneError, match="not a whole EXR"):
             sequence.read_frame(torn)
     torn.write_bytes(data[:3000] + bytes(len(data) - 3000))
-    assert not sequence.is_whole(torn)
+    assert sequence.why_not_whole(torn) == "not whole"
     assert sequence.why_not_whole(tmp_path / "none.exr") == "missing"
 
 
@@ -213,8 +213,6 @@ def test_tone_curve():
     assert 110 < mapped[1, 0] < 135  # middle grey stays in the middle
     assert (np.diff(mapped[:5, 0]) > 0).all() and mapped[4, 0] >= 254 and mapped[5, 0] >= 254
     np.testing.assert_array_equal(tone_map(grey / 2, exposure=1), tone_map(grey))
-    x = np.linspace(0, 1, 100)
-    np.testing.assert_allclose(decode_srgb(encode_srgb(x)), x, atol=1e-12)
 
 
 def test_exr_of_other_programs(tmp_path):

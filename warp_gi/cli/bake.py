@@ -5,39 +5,44 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from warp_gi import launch
+from warp_gi import launch, registry
 from warp_gi.baking import Bake
-from warp_gi.cli.inputs import DEFAULT_SCENE, SceneOptions, find_camera, find_scene, has_camera, parse_resolution
-from warp_gi.cli.options import flag, parse_options
-from warp_gi.cli.report import Reporter, start_warp
-from warp_gi.cli.techniques import DEFAULT_TECHNIQUE, TECHNIQUES, Settings, technique_of
-from warp_gi.errors import OptionError
+from warp_gi.cli.inputs import (
+    BAKE_SUFFIX,
+    DEFAULT_SCENE,
+    SceneOptions,
+    find_camera,
+    find_scene,
+    has_camera,
+    parse_resolution,
+)
+from warp_gi.cli.options import flag, parse_options, value_given
+from warp_gi.cli.report import Reporter, run_command
+from warp_gi.errors import OptionError, unknown_name
+from warp_gi.estimator import Estimator
 from warp_gi.files import check_writable, remove_stale_parts
 from warp_gi.rendering import bake
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.scene import Scene
+from warp_gi.techniques.bake_tool import BakeTool
+
+BAKEABLE = registry.bakeable()
+DEFAULT_TECHNIQUE = next(iter(BAKEABLE))
 
 DESCRIPTION = """Compute once what an estimator needs, and save it for `warp-gi render --bake FILE`.
 
-Without SCENE, the built-in atrium. The file appears whole or not at all. --technique decides
+Without SCENE, the built-in {scene}. The file appears whole or not at all. --technique decides
 what is baked, and which settings there are; --technique NAME --help lists them.
 
-  visibility-field     Which way the sky is seen, in the cells that the camera path sees.
-                       Of the geometry alone: one bake serves every sky.
-  light-field-probes   The light all around each point of a grid, under the scene's sky, over
-                       the space that paths from the camera reach, wherever it goes.
+{techniques}
 
-  warp-gi bake hall.glb --cell-size 0.5 --camera path.json
-  warp-gi bake hall.glb --everywhere --export out/hall.png -o out/hall.dvf.safetensors
-  warp-gi bake atrium --show out/atrium_field
-  warp-gi bake hall.glb --technique light-field-probes --environment city.exr --counts 4 4 4
-  warp-gi bake atrium --technique light-field-probes --export out/a.exr --show out/atrium_probes"""
+{examples}"""
 
 
 @dataclass
@@ -45,11 +50,11 @@ class BakeOptions(SceneOptions):
     """What to bake, and how."""
 
     environment: Annotated[str, flag("SKY", "the scene's own")] = ""
-    """The sky, as in render. Probes hold its light; of a visibility field only the pictures depend on it."""
+    """The sky, as in render. What is baked holds its light, or only its pictures do: see above."""
     technique: Annotated[str, flag("NAME", DEFAULT_TECHNIQUE)] = DEFAULT_TECHNIQUE
-    """What to bake for: visibility-field or light-field-probes. Its settings are the flags below."""
+    """What to bake for, by its long or short name: see above. Its settings are the flags below."""
     everywhere: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Bake all cells of a visibility field, not just those that the camera path sees."""
+    """Bake all of the scene, where a technique otherwise bakes what the camera path sees."""
     picture: Annotated[str, flag("WxH", "the camera's own")] = ""
     """Width and height in pixels at which the camera sees, render's --resolution."""
     seed: int = 1
@@ -59,28 +64,21 @@ class BakeOptions(SceneOptions):
     threads: Annotated[int | None, flag("N", "every core")] = None
     """Threads on the CPU. The bake does not depend on it."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE", help_behavior_hint="")] = None
-    """Where the bake goes (default: out/NAME.dvf.safetensors; of probes out/NAME.probes.safetensors)."""
+    """Where the bake goes (default: out/NAME.SHORT.safetensors, with the short name of the technique)."""
     show: Annotated[Path | None, flag("FOLDER", "none")] = None
-    """Write pictures of the bake. Of a visibility field: its maps, labels, how many rays are left to trace, and the
-    error. Of probes: their maps, their places in the view, and the path of a ray through the maps."""
+    """Write pictures of the bake; above is what they show."""
     export: Annotated[Path | None, flag("FILE", "none")] = None
-    """Write the bake as textures for other programs, and a .json that says how to read them. A visibility field: a
-    .png for each layer (#### is its number), or one .exr. Probes: atlases NAME.radiance.exr and so on for NAME.exr."""
+    """Write the bake as textures for other programs, and a .json that says how to read them; above is which files."""
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print nothing but errors."""
-    settings: Annotated[Settings, tyro.conf.arg(name="")] = field(
-        default_factory=TECHNIQUES[DEFAULT_TECHNIQUE].settings
+    settings: Annotated[Estimator, tyro.conf.arg(name="")] = field(
+        default_factory=lambda: tool_of(DEFAULT_TECHNIQUE).settings()
     )
 
 
 def main(arguments: Sequence[str]) -> int:
     """Run the command."""
-    options = parse(arguments)
-    start_warp(options.device)
-    if options.threads is not None:
-        launch.set_threads(options.threads)
-    run(options, Reporter(options.quiet))
-    return 0
+    return run_command(parse(arguments), run)
 
 
 def parse(arguments: Sequence[str]) -> BakeOptions:
@@ -89,31 +87,79 @@ def parse(arguments: Sequence[str]) -> BakeOptions:
     Raises OptionError for those that are unknown or cannot be read.
     """
     name = technique_of(arguments)
-    default = BakeOptions(technique=name, settings=TECHNIQUES[name].settings())
-    config = (tyro.conf.AvoidSubcommands,)
-    return parse_options(BakeOptions, "bake", arguments, description=DESCRIPTION, default=default, config=config)
+    default = BakeOptions(technique=name, settings=tool_of(name).settings())
+    options = parse_options(BakeOptions, "bake", arguments, description(), default)
+    options.technique = name
+    return options
+
+
+def tool_of(technique: str) -> BakeTool:
+    """Return the tool of a technique, by its long name."""
+    return registry.bake_tool(technique)
+
+
+def technique_of(arguments: Sequence[str]) -> str:
+    """Return the long name of the technique that the arguments of the command ask for, by its long or short one.
+
+    Raises OptionError for an unknown one, and for a flag that is a setting of another one only.
+    """
+    given = value_given(arguments, "--technique")
+    long_names = {one.short: name for name, one in BAKEABLE.items()}
+    chosen = DEFAULT_TECHNIQUE if given is None else long_names.get(given, given)
+    if chosen not in BAKEABLE:
+        raise unknown_name("technique", chosen, BAKEABLE)
+    names = {name: {field.name for field in fields(tool_of(name).settings)} for name in BAKEABLE}
+    for argument in arguments:
+        flag = argument.partition("=")[0]
+        setting = flag.removeprefix("--").removeprefix("no-").replace("-", "_")
+        owner = next((name for name in names if setting in names[name]), None)
+        if flag.startswith("--") and owner is not None and setting not in names[chosen]:
+            raise OptionError(
+                f"{flag} is a setting of {owner}, but {chosen} is baked; leave it out, or give --technique {owner}"
+            )
+    return chosen
+
+
+def description() -> str:
+    """Return the head of the command's help: what each technique bakes, shows and exports, and examples."""
+    titles = {name: f"{name}, {one.short}" for name, one in BAKEABLE.items()}
+    width = max(map(len, titles.values())) + 3
+    lines, examples = [], []
+    for name, title in titles.items():
+        tool = tool_of(name)
+        said = [*tool.summary, *_labelled("--show: ", tool.shows), *_labelled("--export: ", tool.exports)]
+        lines += [f"  {head:<{width}}{line}" for head, line in zip([title, *[""] * len(said)], said, strict=False)]
+        asked = "" if name == DEFAULT_TECHNIQUE else f" --technique {name}"
+        for example in tool.examples:
+            scene, _, settings = example.partition(" ")
+            examples.append(f"  warp-gi bake {scene}{asked} {settings}")
+    return DESCRIPTION.format(scene=DEFAULT_SCENE, techniques="\n".join(lines), examples="\n".join(examples))
+
+
+def _labelled(label: str, lines: Sequence[str]) -> list[str]:
+    return [f"{label if number == 0 else ''}{line}" for number, line in enumerate(lines)]
 
 
 def run(options: BakeOptions, report: Reporter) -> None:
     """Bake, save, and write what else was asked for."""
-    technique = TECHNIQUES[options.technique]
+    tool = tool_of(options.technique)
     if options.seed < 0:
         raise OptionError(f"seed must be 0 or above, got {options.seed}")
-    technique.check(options.settings, options.everywhere)
+    tool.check(options.settings, options.everywhere)
     output = options.output or default_output(options)
-    if output.suffix.lower() != ".safetensors":
+    if output.suffix.lower() != BAKE_SUFFIX:
         raise OptionError(f"cannot write {output.name}: bakes are .safetensors files")
     if options.export is not None:
-        technique.check_export_name(options.export)
+        tool.check_export_name(options.export)
     resolution = parse_resolution(options.picture) if options.picture else None
     with report.phase("scene"):
         scene = find_scene(options)
-        is_of_view = technique.is_of_view and not (technique.bakes_unseen and not has_camera(options, scene))
+        is_of_view = has_camera(options, scene) or not tool.finds_places
         camera = find_camera(options, scene, report) if is_of_view or options.show is not None else None
     if resolution and camera is not None:
         camera = camera.at_resolution(*resolution)
     report.line(f"{scene.name}: {scene.triangle_count:,} triangles")
-    technique.check_scene(options.settings, scene)
+    tool.check_scene(options.settings, scene)
     for file in (output, options.export):
         if file is not None and file.is_dir():
             raise OptionError(f"{file}: is a folder; name a file in it")
@@ -138,30 +184,33 @@ def run(options: BakeOptions, report: Reporter) -> None:
         report.line(f"{compiled:.1f} s of that compiling kernels")
     if options.export is not None:
         with report.phase("export"):
-            files = technique.export(result, options.export)
+            files = tool.export(result, options.export)
         more = f" to {files[-2].name}" * (len(files) > 2)
-        report.line(f"{technique.exported}: {files[0]}{more}, described by {files[-1]}")
+        report.line(f"{tool.exported}: {files[0]}{more}, described by {files[-1]}")
     if options.show is not None:
         show(options, scene, camera, result, report)
-    rows = [*technique.summary(result, seconds), ("file [MB]", output.stat().st_size / 1e6)]
+    rows = [*tool.rows(result, seconds), ("file [MB]", output.stat().st_size / 1e6)]
     report.table("bake", ("quantity", "value"), rows)
-    technique.report(result, options.settings, report)
+    for table in tool.tables(result):
+        report.table(*table)
+    if advice := tool.advice(result, options.settings):
+        report.line(advice)
     report.line(f"bake: {output}")
 
 
 def show(options: BakeOptions, scene: Scene, camera: Camera | CameraPath, result: Bake, report: Reporter) -> None:
     """Write pictures of a bake, in the first view of the camera."""
-    technique = TECHNIQUES[options.technique]
-    if technique.needs_sky and (scene.environment is None or scene.environment.is_black):
+    tool = tool_of(options.technique)
+    if tool.needs_sky and (scene.environment is None or scene.environment.is_black):
         report.line("there is no sky: the pictures are made under a white one")
         scene.environment = 1.0
     view = camera.camera(0) if isinstance(camera, CameraPath) else camera
     with report.phase("pictures"):
-        technique.write_pictures(scene, view, result, options.settings, options.show, options.device, options.seed)
+        tool.write_pictures(scene, view, result, options.settings, options.show, options.device, options.seed)
     report.line(f"pictures: {options.show}")
 
 
 def default_output(options: BakeOptions) -> Path:
     """Return where the bake goes unless told."""
     name = re.sub(r"[^\w.-]+", "_", Path(options.scene or DEFAULT_SCENE).stem) or "scene"
-    return Path("out") / f"{name}.{TECHNIQUES[options.technique].short_name}.safetensors"
+    return Path("out") / f"{name}.{BAKEABLE[options.technique].short}{BAKE_SUFFIX}"

@@ -11,7 +11,6 @@ from typing import Annotated
 
 import tyro
 
-from warp_gi import launch
 from warp_gi.bench.harness import diff, records, runner, tables
 from warp_gi.bench.harness.gallery import Gallery, PictureSet
 from warp_gi.cli.options import flag, parse_options
@@ -140,9 +139,7 @@ def _run_all(options: Bench) -> int:
 
 
 def _start(options: Bench) -> None:
-    start_warp(options.device)
-    if options.threads is not None:
-        launch.set_threads(options.threads)
+    start_warp(options.device, options.threads)
     for path in (options.html, options.json):
         if path not in (None, Path("-")) and options.suite in (*runner.suites(), ALL):
             check_writable(path.absolute().parent)

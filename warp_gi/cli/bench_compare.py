@@ -12,7 +12,6 @@ from typing import Annotated
 
 import numpy as np
 
-from warp_gi import launch
 from warp_gi.baking import Bake
 from warp_gi.bench.compare import reference as compare_reference
 from warp_gi.bench.compare import rows as compare_rows
@@ -21,9 +20,16 @@ from warp_gi.bench.compare import setup as compare_setup
 from warp_gi.bench.harness import records, runner, tables
 from warp_gi.bench.harness.gallery import PictureSet
 from warp_gi.cli.bench import exit_code, write_html
-from warp_gi.cli.inputs import DEFAULT_SCENE, SceneOptions, find_camera, find_scene, parse_resolution
+from warp_gi.cli.inputs import (
+    BAKE_SUFFIX,
+    DEFAULT_SCENE,
+    SceneOptions,
+    find_camera,
+    find_scene,
+    parse_resolution,
+)
 from warp_gi.cli.options import flag, parse_options
-from warp_gi.cli.render import BAKE_SUFFIX, pipeline_named
+from warp_gi.cli.pipelines import pipeline_named
 from warp_gi.cli.report import Reporter, start_warp
 from warp_gi.errors import OptionError, check_whole
 from warp_gi.files import check_writable
@@ -134,9 +140,7 @@ def parse(arguments: Sequence[str]) -> CompareBench:
 
 def start(options: CompareBench) -> None:
     """Start Warp as the options say, and see that what is written can be."""
-    start_warp(options.device)
-    if options.threads is not None:
-        launch.set_threads(options.threads)
+    start_warp(options.device, options.threads)
     for path in (options.html, options.json):
         if path is not None and path != Path("-"):
             check_writable(path.absolute().parent)

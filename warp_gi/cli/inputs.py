@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from warp_gi.cli.report import Reporter
 
 DEFAULT_SCENE = "atrium"
+BAKE_SUFFIX = ".safetensors"
 
 
 @dataclass

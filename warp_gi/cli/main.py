@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from warp_gi.errors import GiError, unknown_name
+from warp_gi.errors import GiError, one_line, unknown_name
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
@@ -71,12 +71,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (GiError, OSError, MemoryError) as error:
         if os.environ.get("WARP_GI_DEBUG", "0") != "0":
             raise
-        print(f"warp-gi: error: {_one_line(error)}", file=sys.stderr)
+        print(f"warp-gi: error: {_message(error)}", file=sys.stderr)
         return EXIT_ERROR
     except RuntimeError as error:
         if "Failed to allocate" not in str(error) or os.environ.get("WARP_GI_DEBUG", "0") != "0":
             raise
-        print(f"warp-gi: error: not enough memory: {_one_line(error)}", file=sys.stderr)  # Warp's own allocators
+        print(f"warp-gi: error: not enough memory: {_message(error)}", file=sys.stderr)  # Warp's own allocators
         return EXIT_ERROR
     except KeyboardInterrupt as interrupt:
         if is_process:  # a second Ctrl-C would break off the interpreter's leaving with a traceback
@@ -101,15 +101,15 @@ def _dispatch(arguments: list[str]) -> int:
 
 
 def _show_warning(message: Warning | str, *where: object, **more: object) -> None:
-    print(f"warp-gi: warning: {_one_line(message)}", file=sys.stderr)
+    print(f"warp-gi: warning: {_message(message)}", file=sys.stderr)
 
 
-def _one_line(error: BaseException | str) -> str:
+def _message(error: BaseException | str) -> str:
     if isinstance(error, MemoryError):
         return f"not enough memory {error}".strip()
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename2 or error.filename}: {error.strerror}"  # of a rename, the target
-    return " ".join(str(error).split())
+    return one_line(error)
 
 
 if __name__ == "__main__":

@@ -31,22 +31,31 @@ def value_given(arguments: Sequence[str], name: str) -> str | None:
     return value
 
 
-def parse_options(options: type[Options], command: str, arguments: Sequence[str], **settings: Any) -> Options:
-    """Return ``options`` filled from the command line; ``settings`` go to ``tyro.cli``.
+def parse_options(
+    options: type[Options],
+    command: str,
+    arguments: Sequence[str],
+    description: str | None = None,
+    default: Options | None = None,
+) -> Options:
+    """Return ``options`` filled from the command line.
 
-    Raises OptionError for options that are unknown, missing or cannot be read.
+    ``default`` are the options without any arguments; the estimators among its fields decide which settings there are.
+    ``description`` None is the docstring of the class. Raises OptionError for options that are unknown, missing or
+    cannot be read.
     """
+    settings: dict[str, Any] = {} if default is None else {"default": default, "config": (tyro.conf.AvoidSubcommands,)}
     report = io.StringIO()
     try:
         with contextlib.redirect_stderr(report):
-            return tyro.cli(options, prog=f"warp-gi {command}", args=arguments, **settings)
+            return tyro.cli(options, prog=f"warp-gi {command}", args=arguments, description=description, **settings)
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise OptionError(_one_line(report.getvalue(), command)) from None
+        raise OptionError(_first_error(report.getvalue(), command)) from None
 
 
-def _one_line(report: str, command: str) -> str:
+def _first_error(report: str, command: str) -> str:
     """Return what tyro's framed report says: its first part, and the first suggestion if it makes one.
 
     Where stdout does not take lines that are not ASCII, the frame is hyphens, with the title as a part of its own.

@@ -2,44 +2,40 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
-import signal
-import sys
-import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from warp_gi import launch
 from warp_gi.baking import load_bake
-from warp_gi.cli.inputs import DEFAULT_SCENE, SceneOptions, find_camera, find_scene, parse_resolution
-from warp_gi.cli.options import flag, parse_options, value_given
-from warp_gi.cli.report import Reporter, start_warp
-from warp_gi.errors import BakeError, OptionError, unknown_name
-from warp_gi.files import check_writable, remove_stale_parts
-from warp_gi.frame import TERMS, Frame
-from warp_gi.pipeline import Pipeline, estimator_named
-from warp_gi.scene.baked import BakedScene
-from warp_gi.scene.camera import Camera, CameraPath
-from warp_gi.scene.environment import Environment
-from warp_gi.scene.scene import Scene
-from warp_gi.scheduler import FrameScheduler
-from warp_gi.sequence.frames import (
-    frame_attributes,
-    frame_path,
-    parse_frames,
-    read_frame,
-    why_not_whole,
-    write_frame,
-    write_preview,
+from warp_gi.cli.inputs import (
+    BAKE_SUFFIX,
+    DEFAULT_SCENE,
+    SceneOptions,
+    find_camera,
+    find_scene,
+    parse_resolution,
 )
-from warp_gi.sequence.state import Dependence
+from warp_gi.cli.interrupts import stoppable
+from warp_gi.cli.options import flag, parse_options, value_given
+from warp_gi.cli.pipelines import denoiser_named, pipeline_named
+from warp_gi.cli.report import Reporter, run_command
+from warp_gi.errors import OptionError
+from warp_gi.files import check_writable
+from warp_gi.frame import Frame
+from warp_gi.pipeline import Pipeline
+from warp_gi.scene.baked import BakedScene
+from warp_gi.scene.camera import STILL_FPS, Camera, CameraPath
+from warp_gi.scene.scene import Scene
+from warp_gi.scene.turning_sky import TurningSky
+from warp_gi.scheduler import FrameScheduler
+from warp_gi.sequence.frames import parse_frames
+from warp_gi.sequence.resume import Output, Plan, SequenceRun, Shot, shots_of
 from warp_gi.techniques.reuse.pictures import check_pictures, reuse_pictures
 
 DESCRIPTION = """Render a sequence of frames to EXR files with named layers, and PNG previews.
@@ -55,8 +51,6 @@ all: stop with Ctrl-C or kill the process at any time, and carry on with --resum
   warp-gi render out/hall.probes.safetensors --camera path.json
   warp-gi render warehouse --pipeline reuse --reuse-pictures out/reuse --reuse-pixel 320 300
   warp-gi render cornell_box --pipeline path,emitters=UniformLights --indirect.max-depth 4"""
-
-BAKE_SUFFIX = ".safetensors"
 
 
 @dataclass
@@ -105,30 +99,9 @@ class Render(SceneOptions):
     settings: Annotated[Pipeline, tyro.conf.arg(name="")] = field(default_factory=Pipeline)
 
 
-@dataclass
-class Shot:
-    """A frame to render, and where it goes."""
-
-    index: int
-    previous: int
-    """The frame that motion is towards."""
-    path: Path
-    time: float
-    """Seconds."""
-    camera: Camera
-    previous_camera: Camera
-    lineage: str = ""
-    """Hash of all that decides this frame and those before it, where it depends on them."""
-
-
 def main(arguments: Sequence[str]) -> int:
     """Run the command."""
-    options = parse(arguments)
-    start_warp(options.device)
-    if options.threads is not None:
-        launch.set_threads(options.threads)
-    run(options, Reporter(options.quiet))
-    return 0
+    return run_command(parse(arguments), run)
 
 
 def parse(arguments: Sequence[str]) -> Render:
@@ -137,45 +110,11 @@ def parse(arguments: Sequence[str]) -> Render:
     is_bake = any(a.endswith(BAKE_SUFFIX) and b != "--bake" for a, b in zip(arguments, before, strict=False))
     settings = pipeline_named(value_given(arguments, "--pipeline") or ("probe_view" if is_bake else "path"))
     if denoiser := value_given(arguments, "--denoise"):
-        settings = replace(settings, denoise=_denoiser(denoiser))
-    default = Render(settings=settings)
-    options = parse_options(
-        Render,
-        "render",
-        arguments,
-        description=DESCRIPTION,
-        default=default,
-        config=(tyro.conf.AvoidSubcommands,),
-    )
+        settings = replace(settings, denoise=denoiser_named(denoiser))
+    options = parse_options(Render, "render", arguments, DESCRIPTION, Render(settings=settings))
     if not options.scene and not {"--preview", "--no-preview"} & set(arguments):
         options.preview = True
     return options
-
-
-def pipeline_named(text: str) -> Pipeline:
-    """Return the pipeline of "path" or "path,indirect=none,emitters=UniformLights,denoise=SpatioTemporal".
-
-    Raises OptionError for unknown presets, terms, estimators and denoisers.
-    """
-    name, *changes = text.split(",")
-    pipeline = Pipeline.preset(name.strip())
-    for change in changes:
-        term, _, estimator = (part.strip() for part in change.partition("="))
-        if term == "denoise":
-            pipeline = replace(pipeline, denoise=_denoiser(estimator))
-            continue
-        if term not in TERMS:
-            raise unknown_name("term of a pipeline", term, (*TERMS, "denoise"))
-        if estimator.lower() == "none":
-            pipeline = replace(pipeline, **{term: None})
-        else:
-            pipeline = replace(pipeline, **{term: estimator_named(term, estimator)})
-    return pipeline
-
-
-def _denoiser(name: str) -> str | None:
-    """Return what a pipeline takes for "none", "oidn", "SpatioTemporal"."""
-    return None if name.lower() == "none" else name.lower()
 
 
 def run(options: Render, report: Reporter) -> None:
@@ -189,213 +128,99 @@ def run(options: Render, report: Reporter) -> None:
         camera = find_camera(options, scene, report)
     if resolution:
         camera = camera.at_resolution(*resolution)
-    if isinstance(scene, BakedScene):
-        report.line(f"{scene.name}: a bake, without its scene")
-        if options.environment:
-            raise OptionError("--environment goes with a scene; a bake shows the sky that it was baked under")
-        if options.environment_turn or options.smooth is not None or options.scale != 1.0:
-            raise OptionError("--environment-turn, --smooth and --scale go with a scene; a bake shows what was baked")
-    else:
-        report.line(f"{scene.name}: {scene.triangle_count:,} triangles, {scene.emitter_count:,} emitters")
-    shots = plan(options, camera)
-    sky = scene.environment
-    if not math.isfinite(options.environment_turn):
-        raise OptionError(f"--environment-turn must be a finite number of degrees, got {options.environment_turn:g}")
-    if options.environment_turn and sky is None:
-        raise OptionError(f"--environment-turn needs a sky to turn, and {scene.name} has none; give --environment too")
-    turn_sky(options, scene, sky, shots[0].index)
+    describe(options, scene, report)
+    shots = find_shots(options, camera)
+    turn_sky(options, scene, camera)
     source = scene.bake if isinstance(scene, BakedScene) else scene
     scheduler = FrameScheduler(source, camera, options.settings, options.device, options.seed, report.stage, bakes)
     if options.reuse_pictures is not None:
         check_pictures(scheduler, shots[-1].camera, options.reuse_pixel)
+    sequence = SequenceRun(scheduler, shots, find_output(options))
     with report.phase("bake"):
-        scheduler.bake()
-    dependence = scheduler.dependence([shot.index for shot in shots], sky_changes=bool(options.environment_turn))
-    done, before = [], ""
-    for shot in shots:
-        if options.resume or dependence.on_past:
-            turn_sky(options, scene, sky, shot.index)  # what the frame's file has to say
-        if dependence.on_past:
-            before = shot.lineage = lineage(options, shot, scheduler, before)
-        done.append(options.resume and is_done(options, shot, scheduler, report))
-    todo = [shot for shot, is_there in zip(shots, done, strict=True) if not is_there]
-    if todo and any(done) and dependence.on_past:
-        whole = shots[: done.index(False)] if dependence.is_saved else []
-        todo = shots[known_frames(options, scheduler, whole) :]
-        if len(todo) == len(shots):
-            report.line(why_all(dependence))
+        sequence.bake()
+    plan = sequence.plan(options.resume)
     if options.reuse_pictures is not None:
-        if not todo:
+        if not plan.todo:
             raise OptionError("--reuse-pictures needs a frame to render, and all are there already; leave --resume out")
         check_writable(options.reuse_pictures)
-    if todo:
-        check_writable(options.output.parent)
-        remove_stale_parts(state_path(options))
-    if len(todo) < len(shots):
-        report.line(f"{len(shots) - len(todo)} of {len(shots)} frames are there already")
+    sequence.prepare(plan)
     started = time.perf_counter()
-    times: dict[str, list[float]] = {}
     try:
-        with stoppable() as stop, report.bar(len(todo)):
-            for shot in todo:
-                turn_sky(options, scene, sky, shot.index)
-                frame, stages = render_shot(options, shot, scheduler, report)
-                for stage, seconds in stages.items():
-                    times.setdefault(stage, []).append(seconds)
-                if dependence.is_saved and shot.path.suffix.lower() == ".exr":  # nothing resumes from others
-                    saving = time.perf_counter()
-                    scheduler.save_state(state_path(options), shot.lineage)
-                    times.setdefault("save state", []).append(time.perf_counter() - saving)
-                if options.reuse_pictures is not None and shot is todo[-1]:
-                    reuse_pictures(scheduler, frame, options.reuse_pictures, options.reuse_pixel)
-                    report.line(f"pictures: {options.reuse_pictures}")
-                del frame  # before there is a next one
-                if stop.is_set():
-                    raise KeyboardInterrupt
+        times = render_shots(options, plan, sequence, report)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("finished frames are kept, --resume renders the others") from None
-    count = f"{len(todo)} frame{'s' * (len(todo) != 1)}"
+    count = f"{len(plan.todo)} frame{'s' * (len(plan.todo) != 1)}"
     report.line(f"{count} in {time.perf_counter() - started:.1f} s: {options.output}")
-    if options.verbose and todo:
+    if options.verbose and plan.todo:
         times["bake"] = times["bake"][:1]  # every frame names the one bake
         rows = [(stage, *(f"{x:.3f}" for x in (v[0], sum(v) / len(v), max(v), sum(v)))) for stage, v in times.items()]
         report.table("seconds by stage", ("stage", "first frame", "mean", "largest", "sum"), rows)
 
 
-def render_shot(
-    options: Render, shot: Shot, scheduler: FrameScheduler, report: Reporter
-) -> tuple[Frame, dict[str, float]]:
-    """Render a frame and write it; return it, and the seconds of its stages."""
-    remove_stale_parts(shot.path)
-    started, compiled = time.perf_counter(), launch.compile_seconds
-    frame = scheduler.frame(shot.index, shot.previous)
-    if shot.lineage:
-        frame.metadata["lineage"] = shot.lineage
-    rendered = time.perf_counter()
-    write_shot(options, frame, shot.path)
-    finished = time.perf_counter()
-    compiled = launch.compile_seconds - compiled
-    seconds = finished - started - compiled
-    note = f" and {compiled:.1f} s compiling kernels" if compiled > 0.5 else ""
-    report.frame(f"{shot.path} {seconds:.2f} s{note}", seconds)
-    return frame, {**frame.timings, "write": finished - rendered}
-
-
-@contextmanager
-def stoppable() -> Iterator[threading.Event]:
-    """Yield an event that Ctrl-C sets, besides raising KeyboardInterrupt, which a finaliser may swallow."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
+def describe(options: Render, scene: Scene | BakedScene, report: Reporter) -> None:
+    """Print what is rendered; raises OptionError for options that do not go with it."""
+    if not isinstance(scene, BakedScene):
+        report.line(f"{scene.name}: {scene.triangle_count:,} triangles, {scene.emitter_count:,} emitters")
         return
-
-    def interrupt(number: int, frame: object) -> None:
-        stop.set()
-        raise KeyboardInterrupt
-
-    def unraisable(report: Any) -> None:
-        if not issubclass(report.exc_type, KeyboardInterrupt):
-            hook(report)
-
-    hook, sys.unraisablehook = sys.unraisablehook, unraisable
-    handler = signal.signal(signal.SIGINT, interrupt)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, handler)
-        sys.unraisablehook = hook
+    report.line(f"{scene.name}: a bake, without its scene")
+    if options.environment:
+        raise OptionError("--environment goes with a scene; a bake shows the sky that it was baked under")
+    if options.environment_turn or options.smooth is not None or options.scale != 1.0:
+        raise OptionError("--environment-turn, --smooth and --scale go with a scene; a bake shows what was baked")
 
 
-def plan(options: Render, camera: Camera | CameraPath) -> list[Shot]:
+def find_shots(options: Render, camera: Camera | CameraPath) -> list[Shot]:
     """Return the frames that were asked for."""
     if options.frames:
         frames = parse_frames(options.frames)
     else:
         frames = list(range(camera.frame_count)) if isinstance(camera, CameraPath) else [0]
-    if len(frames) > 1 and "#" not in options.output.name:
-        raise OptionError(f"{len(frames)} frames cannot all go to {options.output}; put #### in the name")
-    suffix = options.output.suffix.lower()
-    if suffix not in (".exr", ".png"):
-        raise OptionError(f"cannot write {options.output.name}: frames are .exr or .png files")
-    if suffix == ".png" and options.resume:
+    return shots_of(camera, frames, options.output)
+
+
+def find_output(options: Render) -> Output:
+    """Return the files that were asked for."""
+    output = Output(options.output, options.precision, options.preview, options.exposure)
+    if options.resume and not output.is_exr:
         raise OptionError("--resume needs .exr files, which say how they were made; a .png does not")
-    path = camera if isinstance(camera, CameraPath) else CameraPath.still(camera)
-    at = path.camera if path is camera else lambda index: camera
-    previous = [max(frames[0] - 1, 0), *frames]
-    return [
-        Shot(index, before, frame_path(options.output, index), index / path.fps, at(index), at(before))
-        for index, before in zip(frames, previous, strict=False)
-    ]
+    return output
 
 
-def turn_sky(options: Render, scene: Scene, sky: Environment | None, index: int) -> None:
-    """Give the scene the sky of frame ``index``; ``sky`` is that of frame 0."""
-    if options.environment_turn and sky is not None:
-        turned = sky.rotated(math.fmod(index * options.environment_turn, 360.0))
-        if scene.environment is None or turned.rotation != scene.environment.rotation:
-            scene.environment = turned
+def turn_sky(options: Render, scene: Scene | BakedScene, camera: Camera | CameraPath) -> None:
+    """Let the sky turn, if it was asked to."""
+    turn, sky = options.environment_turn, scene.environment
+    if not math.isfinite(turn):
+        raise OptionError(f"--environment-turn must be a finite number of degrees, got {turn:g}")
+    if turn and sky is None:
+        raise OptionError(f"--environment-turn needs a sky to turn, and {scene.name} has none; give --environment too")
+    if turn:
+        scene.environment = TurningSky(sky, turn, camera.fps if isinstance(camera, CameraPath) else STILL_FPS)
 
 
-def state_path(options: Render) -> Path:
-    """Return where a sequence keeps what it has learnt, beside its frames."""
-    stem = options.output.stem.replace("#", "").strip("._-") or "frames"
-    return options.output.with_name(f"{stem}.state.safetensors")
+def render_shots(options: Render, plan: Plan, sequence: SequenceRun, report: Reporter) -> dict[str, list[float]]:
+    """Render what is to be rendered; return the seconds of each stage, frame by frame."""
+    times: dict[str, list[float]] = {}
+    with stoppable() as stop, report.bar(len(plan.todo)):
+        for shot in plan.todo:
+            frame, _ = render_shot(shot, sequence, report)
+            sequence.save_state(shot, frame)
+            for stage, seconds in frame.timings.items():
+                times.setdefault(stage, []).append(seconds)
+            if options.reuse_pictures is not None and shot is plan.todo[-1]:
+                reuse_pictures(sequence.scheduler, frame, options.reuse_pictures, options.reuse_pixel)
+                report.line(f"pictures: {options.reuse_pictures}")
+            del frame  # before there is a next one
+            if stop.is_set():
+                raise KeyboardInterrupt
+    return times
 
 
-def lineage(options: Render, shot: Shot, scheduler: FrameScheduler, before: str) -> str:
-    """Return a hash of all that decides a frame and those before it, whose hash is ``before``."""
-    attributes = frame_attributes(
-        shot.index, shot.time, shot.camera, scheduler.metadata(), shot.previous_camera, options.precision
-    )
-    return hashlib.sha256(f"{before}{shot.camera.resolution}{attributes}".encode()).hexdigest()
-
-
-def known_frames(options: Render, scheduler: FrameScheduler, whole: list[Shot]) -> int:
-    """Return how many of the first frames, which are whole, a saved state knows; the scheduler then goes on from it."""
-    lineages = [shot.lineage for shot in whole]
-    path = state_path(options)
-    if not path.exists():
-        return 0
-    try:
-        known = load_bake(path).settings.get("lineage")
-        if known not in lineages:
-            return 0
-        scheduler.load_state(path, known)
-    except BakeError:  # damaged
-        return 0
-    return lineages.index(known) + 1
-
-
-def why_all(dependence: Dependence) -> str:
-    """Return why every frame is rendered again where some are there already."""
-    lights = {"denoiser": "the denoiser"}
-    names = [lights.get(name, f"the {name} light") for name in dependence.unsaved or dependence.on_past]
-    reason = "" if dependence.unsaved else "no saved state fits, and "
-    return (
-        f"every frame is rendered again: {reason}{' and '.join(names)} depend{'s' * (len(names) == 1)} "
-        "on the frames before"
-    )
-
-
-def is_done(options: Render, shot: Shot, scheduler: FrameScheduler, report: Reporter) -> bool:
-    """Return whether the frame's file is whole and made with the same settings; adds a missing preview."""
-    metadata = scheduler.metadata() | ({"lineage": shot.lineage} if shot.lineage else {})
-    expected = frame_attributes(shot.index, shot.time, shot.camera, metadata, shot.previous_camera, options.precision)
-    problem = why_not_whole(shot.path, expected, shot.camera)
-    if problem is None:
-        preview = shot.path.with_suffix(".png")
-        if options.preview and not preview.exists():
-            write_preview(read_frame(shot.path), preview, options.exposure)
-    elif problem != "missing":
-        report.line(f"{shot.path} is rendered again: {problem}")
-    return problem is None
-
-
-def write_shot(options: Render, frame: object, path: Path) -> None:
-    """Write the preview, then the frame: a whole frame has its preview."""
-    if path.suffix.lower() == ".png":
-        write_preview(frame, path, options.exposure)
-        return
-    if options.preview:
-        write_preview(frame, path.with_suffix(".png"), options.exposure)
-    write_frame(frame, path, options.precision)
+def render_shot(shot: Shot, sequence: SequenceRun, report: Reporter) -> tuple[Frame, dict[str, float]]:
+    """Render a frame and write it; return it, and the seconds of its stages."""
+    started, compiled = time.perf_counter(), launch.compile_seconds
+    frame = sequence.render(shot)
+    compiled = launch.compile_seconds - compiled
+    seconds = time.perf_counter() - started - compiled
+    note = f" and {compiled:.1f} s compiling kernels" if compiled > 0.5 else ""
+    report.frame(f"{shot.path} {seconds:.2f} s{note}", seconds)
+    return frame, frame.timings

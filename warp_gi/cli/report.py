@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import warp as wp
 
@@ -233,10 +233,29 @@ def _parts(widths: Sequence[int], names: Sequence[int], limit: int) -> list[list
     return parts or [[*names]]
 
 
-def start_warp(device: str = "cpu") -> None:
+class RunOptions(Protocol):
+    """Options that every command that renders or bakes has."""
+
+    device: str
+    threads: int | None
+    quiet: bool
+
+
+Options = TypeVar("Options", bound=RunOptions)
+
+
+def run_command(options: Options, run: Callable[[Options, Reporter], None]) -> int:
+    """Start Warp as the options of a command say, run it, and return its exit code."""
+    start_warp(options.device, options.threads)
+    run(options, Reporter(options.quiet))
+    return 0
+
+
+def start_warp(device: str = "cpu", threads: int | None = None) -> None:
     """Start Warp without its greeting, module log, or word on a missing CUDA driver; check that the device is there.
 
-    Raises OptionError if it is not.
+    ``threads`` is how many the CPU may use; None leaves that as it is. Raises OptionError for a device that is not
+    there, or a number of threads out of range.
     """
     wp.config.log_level = wp.LOG_WARNING
     sys.stderr.flush()
@@ -250,6 +269,8 @@ def start_warp(device: str = "cpu") -> None:
         os.close(nowhere)
     _keep_heap_whole()
     launch.get_device(device)
+    if threads is not None:
+        launch.set_threads(threads)
 
 
 def _keep_heap_whole() -> None:

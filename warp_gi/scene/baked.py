@@ -21,6 +21,7 @@ class BakedScene:
     version = 0
     environment = None
     is_animated = False
+    is_sky_animated = False
     triangle_count = 0
     emitter_count = 0
     nodes: tuple[()] = ()
@@ -49,6 +50,10 @@ class BakedScene:
 
     def update(self, *times: Any) -> bool:
         """Return False: nothing moves."""
+        return False
+
+    def update_sky(self, time: float) -> bool:
+        """Return False: the sky is that of the bake."""
         return False
 
     def check_unchanged(self) -> None:

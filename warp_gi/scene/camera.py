@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 Vec3 = tuple[float, float, float]
 
 LARGEST_SIDE = 1 << 16  # pixels; their Morton code has 16 bits an axis
+STILL_FPS = 24.0
 LARGEST_COUNT = 1 << 30  # pixels; kernels count them in int32
 
 
@@ -296,6 +297,11 @@ class CameraPath:
         ]
         document = {"fps": self.fps, "resolution": list(self.resolution), "keyframes": keys}
         Path(path).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+
+
+def frame_time(camera: Camera | CameraPath, index: int) -> float:
+    """Return the time of a frame in seconds: that of the path, or of ``STILL_FPS`` frames a second."""
+    return index / (camera.fps if isinstance(camera, CameraPath) else STILL_FPS)
 
 
 def _three(values: Sequence[float]) -> Vec3:

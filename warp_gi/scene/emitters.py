@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from warp_gi.color import LUMINANCE
 from warp_gi.errors import SceneError
 from warp_gi.kernels import types
 from warp_gi.scene.geometry import FlatGeometry
 from warp_gi.scene.model import Material, Node, PunctualLight
-from warp_gi.scene.textures import LUMINANCE, box_means, linear_rgb
+from warp_gi.scene.textures import box_means, linear_rgb
 
 LIGHT_KINDS = {
     "point": types.EMITTER_POINT,
@@ -20,6 +22,18 @@ LIGHT_KINDS = {
 
 SMALLEST_AREA = 1e-18
 """Square metres; a smaller triangle cannot be sampled in float32 and is no emitter."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedEmitters:
+    """The emitters of a scene, where they are in the pose of one device; see ``Scene.placed_emitters``."""
+
+    table: np.ndarray
+    """types.Emitter [emitter]: emissive triangles, then punctual lights."""
+    corners: np.ndarray
+    """float64 [emissive triangle, 3, 3]: corners in world space, metres; of the first emitters of the table."""
+    two_sided: np.ndarray
+    """bool [emissive triangle]: whether both sides shine."""
 
 
 def check_light(light: PunctualLight, nodes: Sequence[Node]) -> None:

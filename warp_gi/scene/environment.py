@@ -24,7 +24,8 @@ import numpy as np
 import warp as wp
 
 from warp_gi.alias import AliasTable
-from warp_gi.errors import SceneError
+from warp_gi.color import LUMINANCE, decode_srgb
+from warp_gi.errors import SceneError, one_line
 from warp_gi.kernels import types
 from warp_gi.launch import get_device, on_device
 from warp_gi.scene import harmonics
@@ -34,7 +35,6 @@ from warp_gi.scene.watching import Watch
 
 __all__ = ["Environment", "SunSky", "as_environment"]
 
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 LARGEST_HEIGHT = 4096  # texel coordinates must be exact in float32 with bits left to interpolate
 NEGLIGIBLE_NEGATIVE = 1e-4  # of the sum of all pixels
 
@@ -174,6 +174,11 @@ class Environment:
         digest.update(self._map.digest if self._map else np.array(self.color or (0.0, 0.0, 0.0)).tobytes())
         return digest.hexdigest()
 
+    @property
+    def appearance(self) -> tuple[Any, ...]:
+        """All that determines the radiance, to the last bit of a rotation; equal for skies that look the same."""
+        return self.rotation, self.scale, self.color, self._map and self._map.digest
+
     def rotated(self, degrees: float) -> Environment:
         """Return this sky turned about +y by ``degrees``, counter-clockwise seen from above; pixels are shared."""
         rotation = self.rotation + degrees
@@ -273,14 +278,16 @@ def _read_image(path: Path) -> np.ndarray:
         raise SceneError(f"{name}: the file is empty")
     image = oiio.ImageInput.open(str(path))
     if image is None:
-        raise SceneError(f"{name}: not an image that can be read ({_one_line(oiio.geterror())})")
+        raise SceneError(f"{name}: not an image that can be read ({one_line(oiio.geterror(), 'no reason given')})")
     try:
         spec = image.spec()
         if spec.width < 1 or spec.height < 1:
             raise SceneError(f"{name}: the image has no pixels ({spec.width}x{spec.height})")
         pixels = image.read_image(0, 0, 0, spec.nchannels, oiio.FLOAT)
         if pixels is None or image.has_error:
-            raise SceneError(f"{name}: the image is damaged or cut short ({_one_line(image.geterror())})")
+            raise SceneError(
+                f"{name}: the image is damaged or cut short ({one_line(image.geterror(), 'no reason given')})"
+            )
     finally:
         image.close()
     names = [channel.upper() for channel in spec.channelnames]
@@ -289,9 +296,5 @@ def _read_image(path: Path) -> np.ndarray:
         colors = [0, 0, 0]
     pixels = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)[..., colors]
     if spec.format.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE):
-        pixels = np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4).astype(np.float32)
+        pixels = decode_srgb(pixels)
     return np.ascontiguousarray(pixels)
-
-
-def _one_line(message: str) -> str:
-    return " ".join(message.split()) or "no reason given"

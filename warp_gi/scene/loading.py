@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_gi.errors import OptionError, SceneError
+from warp_gi.errors import OptionError, SceneError, one_line
 from warp_gi.scene.files.images import missing_file
 from warp_gi.scene.files.parts import SceneParts
 from warp_gi.scene.geometry import triangulated
@@ -51,7 +51,7 @@ def load_scene(
     except SceneError:
         raise
     except (*DAMAGE, struct.error) as error:
-        reason = " ".join(str(error).split())[:200]
+        reason = one_line(error)[:200]
         kind = suffix[1:].upper()
         raise SceneError(
             f"{str(path)!r} cannot be read as {kind} ({type(error).__name__}: {reason}); export or copy it again"

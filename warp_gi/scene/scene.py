@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
-from warp_gi.alias import AliasTable
 from warp_gi.errors import SceneError, unknown_name
 from warp_gi.forks import Guard
 from warp_gi.kernels import types
-from warp_gi.launch import get_device, on_device
+from warp_gi.launch import get_device
 from warp_gi.scene import animation, emitters, geometry, textures
+from warp_gi.scene.device_scene import DeviceScene
 from warp_gi.scene.edits import Edits
 from warp_gi.scene.model import Keyframe, Material, Node, PunctualLight
 
@@ -33,7 +33,8 @@ class Scene:
     Args:
         nodes: Placements of meshes; parents before children. The scene keeps copies of the nodes, not of the meshes.
         lights: Lights without size.
-        environment: The sky: a path to a map, an RGB radiance, an Environment, a SunSky, or None for black.
+        environment: The sky: a path to a map, an RGB radiance, an Environment, a SunSky, or None for black; or a
+            function that returns one of these at a time in seconds, as a ``gi.TurningSky`` does.
         cameras: Cameras by name, in world space, at time 0.
         name: Shown in reports.
         camera_nodes: Which node carries a camera, by the camera's name, for cameras that move with a node.
@@ -57,7 +58,7 @@ class Scene:
         self._guard = Guard()
         self.name = name
         self.version = 0
-        """Counts up when the environment or the animation is replaced: what was derived from the scene is stale."""
+        """Counts up when the environment or the animation becomes another: what was derived from the scene is stale."""
         self.nodes: list[Node] = [replace(node) for node in nodes]
         self.lights: list[PunctualLight] = list(lights)
         self.cameras: dict[str, Camera] = dict(cameras or {})
@@ -68,6 +69,10 @@ class Scene:
             emitters.check_light(light, self.nodes)
         self._flatten()
         self._environment: Environment | None = None
+        self._sky_at: Callable[[float], Any] | None = None
+        self._sky_time: float | None = 0.0
+        """Time that the sky is of, if it is a function of time; None while it changes."""
+        self._sky_shown: tuple[Any, ...] | None = None
         self.environment = environment
 
     def _flatten(self) -> None:
@@ -80,7 +85,7 @@ class Scene:
             raise SceneError(f"scene {self.name!r}: node transforms move vertices past the range of float32")
         self._emissive, self._triangle_powers = emitters.emissive_triangles(self._flat, self.materials)
         self._bounds = self._all_bounds()
-        self._devices: dict[str, _DeviceScene] = {}
+        self._devices: dict[str, DeviceScene] = {}
         self._geometry_hash: str | None = None
         self._contents_hash: str | None = None
         self._edits = Edits(self)
@@ -97,22 +102,52 @@ class Scene:
 
     @property
     def environment(self) -> Environment | None:
-        """The sky; set it to a path, an RGB radiance, an Environment, a SunSky or None. The geometry stays built."""
+        """The sky now; set it to a path, an RGB radiance, an Environment, a SunSky or None. The geometry stays built.
+
+        Set to a function of the time in seconds that returns one of these, as a ``gi.TurningSky`` does, it is another
+        from frame to frame: that of time 0 at first, then that of the last ``update_sky``. For one time the function
+        has to return one sky always. Raises SceneError for what is no sky.
+        """
         return self._environment
 
     @environment.setter
     def environment(self, value: Any) -> None:
-        if value is not None:
-            from warp_gi.scene.environment import as_environment
-
-            value = as_environment(value)
+        sky_at = value if callable(value) and not isinstance(value, type) else None
+        sky = _as_sky(value) if sky_at is None else _sky_at(sky_at, 0.0)
         with self.lock:
-            self._environment = value
-            self.version += 1
-            for device_scene in self._devices.values():
-                device_scene.set_environment(value)
-            if self._devices:
-                self._edits.sky_in_use()
+            self._sky_at, self._sky_time = sky_at, 0.0
+            self._show(sky)
+
+    @property
+    def is_sky_animated(self) -> bool:
+        """Whether the environment is a function of time."""
+        return self._sky_at is not None
+
+    def update_sky(self, time: float) -> bool:
+        """Let the environment be that of ``time`` [s], if it is a function of time; return whether it is another now.
+
+        Each frame does so before anything is baked or traced. Raises SceneError for what is no sky.
+        """
+        with self.lock:
+            if self._sky_at is None or time == self._sky_time:
+                return False
+            self._sky_time, sky = None, _sky_at(self._sky_at, time)
+            is_other = _appearance(sky) != self._sky_shown
+            if is_other:
+                self._show(sky)
+            self._sky_time = time
+            return is_other
+
+    def _show(self, sky: Environment | None) -> None:
+        """Make a sky that of now, for everything derived from the scene and on every device."""
+        self._sky_shown = ("in the making",)  # an interrupt may leave it half done
+        self._environment = sky
+        self.version += 1
+        for device_scene in self._devices.values():
+            device_scene.set_environment(sky)
+        if self._devices:
+            self._edits.sky_in_use()
+        self._sky_shown = _appearance(sky) if self._sky_at is not None else None
 
     @property
     def triangle_count(self) -> int:
@@ -264,11 +299,11 @@ class Scene:
         return animation.world_matrices(self.nodes, time)[index]
 
     def update(self, time: float, previous_time: float | None = None, device: str | wp.Device | None = None) -> bool:
-        """Move the buffers of ``data(device)`` to ``time`` [s]; return whether anything differs from the last call.
+        """Move what is in ``data(device)`` to ``time`` [s]; return whether anything differs from the last call.
 
         ``previous_points`` get the pose of ``previous_time``, from which motion vectors
         follow; None is ``time``, no motion. Nothing is done for a scene without keyframes,
-        and the tree is refit only if a vertex moved.
+        and the tree is refit only if a vertex moved. The sky is moved by ``update_sky``.
         """
         if not self.is_animated:
             return False
@@ -287,10 +322,16 @@ class Scene:
         with self.lock:
             if device.alias not in self._devices:
                 self._edits.check()
-                self._devices[device.alias] = _DeviceScene(self, device)
+                self._devices[device.alias] = DeviceScene(self, device)
                 if len(self._devices) == 1:
                     self._edits.in_use()
             return self._devices[device.alias].data
+
+    def placed_emitters(self, device: str | wp.Device | None = None) -> emitters.PlacedEmitters:
+        """Return where the emitters of ``data(device)`` are, from the copy on the host: nothing is downloaded."""
+        with self.lock:
+            self.data(device)
+            return self._devices[_device(device).alias].placed_emitters()
 
     def check_unchanged(self) -> None:
         """Raise SceneError if something was edited that pictures would not show: one line that says what, and the cure.
@@ -329,132 +370,23 @@ class Scene:
         return np.stack([np.min(boxes, axis=0), np.max(boxes, axis=0)]).astype(np.float32)
 
 
-class _DeviceScene:
-    """The buffers of a scene on one device, and the pose they are in."""
+def _as_sky(value: Any) -> Environment | None:
+    """Return an environment from what ``Scene.environment`` takes, or None."""
+    from warp_gi.scene.environment import as_environment
 
-    def __init__(self, scene: Scene, device: wp.Device) -> None:
-        from warp_gi.bvh import TriangleBvh
-        from warp_gi.scene.masks import alpha_masks
+    return None if value is None else as_environment(value)
 
-        self.scene, self.device = scene, device
-        self.world = self.previous_world = scene._world
-        flat = scene._flat
-        if scene.is_animated:
-            flat = replace(flat, points=flat.points.copy(), normals=flat.normals.copy())
-        self.flat = flat
-        self.previous_points = flat.points.copy() if scene.is_animated else flat.points
-        world = animation.world_matrices(scene.nodes, 0.0)  # lights need not be where they were when it was made
-        self.emitters = emitters.emitter_table(scene._emissive, scene.lights, world)
-        emitter_of = np.full(scene.triangle_count, -1, np.int32)
-        emitter_of[scene._emissive] = np.arange(len(scene._emissive), dtype=np.int32)
-        images = textures.distinct_textures(scene.materials)
-        texture_rows, texels = textures.texture_table(images)
 
-        data = types.SceneData()
-        data.geometry.points = self._array(flat.points, wp.vec3)
-        data.geometry.previous_points = (
-            self._array(self.previous_points, wp.vec3) if scene.is_animated else data.geometry.points
-        )
-        data.geometry.normals = self._array(flat.normals, wp.vec3)
-        data.geometry.uvs = self._array(flat.uvs, wp.vec2)
-        data.geometry.indices = self._array(flat.indices, wp.vec3i)
-        data.geometry.materials = self._array(flat.materials, wp.int32)
-        data.geometry.objects = self._array(flat.objects, wp.int32)
-        data.geometry.emitters = self._array(emitter_of, wp.int32)
-        data.materials = self._array(textures.material_table(scene.materials, images), types.Material)
-        data.textures = self._array(texture_rows, types.Texture)
-        data.texels = self._array(texels, wp.uint32)
-        data.srgb_to_linear = self._array(textures.SRGB_TO_LINEAR.copy(), wp.float32)
-        data.emitters.count = len(self.emitters)
-        data.emitters.emitters = self._array(self.emitters, types.Emitter)
-        data.emitters.alias = wp.empty(0, dtype=types.AliasBucket, device=device)
-        self._bound_emitters(data.emitters)
-        low, high = scene.bounds
-        data.center = wp.vec3(*(float(x) for x in (low.astype(np.float64) + high) / 2.0))
-        data.radius = scene.radius
-        masks = alpha_masks(flat, scene.materials, images, data.textures, data.texels)
-        self.bvh = TriangleBvh(flat.points, flat.indices, device=device.alias, alpha=masks)
-        self._masks, self._resting_bvh = masks, None
-        self._light_table: wp.array | None = None
-        data.bvh = self.bvh.data
-        self.data = data
-        self.set_environment(scene.environment)
+def _sky_at(sky_at: Callable[[float], Any], time: float) -> Environment | None:
+    """Return what a function of time says the sky is; a SceneError of it tells the time."""
+    try:
+        return _as_sky(sky_at(time))
+    except SceneError as error:
+        raise SceneError(f"the sky at {time:g} s: {error}") from error
 
-    def light_table(self) -> wp.array:
-        if self._light_table is None:
-            self._light_table = AliasTable.build(self.scene.emitter_powers()).on(self.device)
-        return self._light_table
 
-    def resting_bvh(self) -> Any:
-        if not self.scene.is_animated:
-            return self.bvh
-        if self._resting_bvh is None:
-            from warp_gi.bvh import TriangleBvh
-
-            rests = ~np.isin(self.flat.objects, list(self.scene.moving_objects))
-            if not rests.any():
-                raise SceneError("everything in this scene moves; nothing can be baked")
-            masks = self._masks and replace(self._masks, face_mask=self._masks.face_mask[rests])
-            self._resting_bvh = TriangleBvh(self.flat.points, self.flat.indices[rests], self.device.alias, masks)
-        return self._resting_bvh
-
-    def _array(self, values: np.ndarray, dtype: Any) -> wp.array:
-        return on_device(values, dtype, self.device)
-
-    def set_environment(self, environment: Environment | None) -> None:
-        self.data.environment = types.Environment() if environment is None else environment.data(self.device)
-
-    def move(self, time: float, previous_time: float) -> bool:
-        """Bring points, normals and lights to ``time`` and previous points to ``previous_time``."""
-        nodes, flat, target = self.scene.nodes, self.flat, self.data.geometry
-        world = animation.world_matrices(nodes, time)
-        previous_world = animation.world_matrices(nodes, previous_time)
-        was, was_before = self.world, self.previous_world
-        # until all is moved no pose is known: the next call after an interrupt or a fork places everything
-        self.world = self.previous_world = [np.full((4, 4), np.nan)] * len(nodes)
-        moved = changed = False
-        for index, node in enumerate(nodes):
-            start, stop = flat.vertex_starts[index : index + 2]
-            if start == stop or not self.scene._moving[index]:
-                continue
-            if not np.array_equal(previous_world[index], was_before[index]):
-                vertex = start
-                for mesh in node.meshes:
-                    end = vertex + len(mesh.points)
-                    self.previous_points[vertex:end] = geometry.transform_points(previous_world[index], mesh.points)
-                    vertex = end
-                self._upload(target.previous_points, self.previous_points, start, stop)
-                changed = True
-            if not np.array_equal(world[index], was[index]):
-                geometry.place(flat, node, world[index], start)
-                self._upload(target.points, flat.points, start, stop)
-                self._upload(target.normals, flat.normals, start, stop)
-                moved = True
-        if any(light.node is not None and self.scene._moving[light.node] for light in self.scene.lights):
-            table = emitters.emitter_table(self.scene._emissive, self.scene.lights, world)
-            changed |= not np.array_equal(table, self.emitters)
-            self.emitters[:] = table
-            self._upload(self.data.emitters.emitters, self.emitters, len(self.scene._emissive), len(self.emitters))
-        if moved:
-            self.bvh.refit(flat.points)
-            self._bound_emitters(self.data.emitters)
-        self.world, self.previous_world = world, previous_world
-        return moved or changed
-
-    def _bound_emitters(self, target: types.Emitters) -> None:
-        """Set the box around all emissive triangles, larger by more than rays' rounding near and far of the origin."""
-        if len(self.scene._emissive) == 0:
-            target.lower, target.upper = wp.vec3(1.0, 1.0, 1.0), wp.vec3(-1.0, -1.0, -1.0)
-            return
-        corners = self.flat.points[self.flat.indices[self.scene._emissive]].reshape(-1, 3).astype(np.float64)
-        margin = 1e-4 * self.scene.radius + 1e-6 * np.abs(corners).max()
-        target.lower = wp.vec3(*(corners.min(axis=0) - margin))
-        target.upper = wp.vec3(*(corners.max(axis=0) + margin))
-
-    def _upload(self, target: wp.array, source: np.ndarray, start: int, stop: int) -> None:
-        """Copy items from ``start`` to ``stop``; on the CPU target and source are the same memory."""
-        if not self.device.is_cpu:
-            target[start:stop].assign(source[start:stop])
+def _appearance(sky: Environment | None) -> tuple[Any, ...] | None:
+    return None if sky is None else sky.appearance
 
 
 def _box_corners(mesh: Any) -> np.ndarray:

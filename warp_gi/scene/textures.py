@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from warp_gi.color import SRGB_TO_LINEAR
 from warp_gi.errors import SceneError
 from warp_gi.kernels import types
 from warp_gi.scene.model import Material, Texture
@@ -13,18 +14,6 @@ from warp_gi.scene.model import Material, Texture
 WRAPS = {"repeat": types.WRAP_REPEAT, "clamp": types.WRAP_CLAMP, "mirror": types.WRAP_MIRROR}
 
 TEXTURE_SLOTS = ("base_color_texture", "metallic_roughness_texture", "normal_texture", "emission_texture")
-
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Weights of linear Rec. 709 red, green and blue."""
-
-
-def _srgb_table() -> np.ndarray:
-    code = np.arange(256) / 255.0
-    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-SRGB_TO_LINEAR = _srgb_table()
-"""float32 [256]: linear value of an 8-bit sRGB code (IEC 61966-2-1)."""
 
 
 def check_texture(texture: Texture, owner: str) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_gi.errors import OptionError, SceneError
+from warp_gi.errors import OptionError, SceneError, one_line
 
 HALF_MAX = 65504.0
 
@@ -122,7 +122,7 @@ def write_exr(
     problem = output.geterror()
     closed = output.close()
     if not written or not closed or problem:
-        problem = " ".join((problem or output.geterror() or "unknown failure").split())
+        problem = one_line(problem or output.geterror(), "unknown failure")
         raise OSError(f"cannot write {path}: {problem}")
 
 
@@ -139,7 +139,7 @@ def read_exr(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Attribu
         raise SceneError(f"{path}: no such file")
     source = oiio.ImageInput.open(str(path))
     if source is None:
-        raise SceneError(f"{path}: not a whole EXR file ({' '.join(oiio.geterror().split())})")
+        raise SceneError(f"{path}: not a whole EXR file ({one_line(oiio.geterror())})")
     try:
         spec = source.spec()
         pixels = source.read_image("float")
@@ -147,7 +147,7 @@ def read_exr(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Attribu
     finally:
         source.close()
     if pixels is None or problem:
-        raise SceneError(f"{path}: not a whole EXR file ({' '.join((problem or 'no pixels').split())})")
+        raise SceneError(f"{path}: not a whole EXR file ({one_line(problem, 'no pixels')})")
     formats = [str(format) for format in spec.channelformats] or [str(spec.format)] * spec.nchannels
     groups: dict[str, list[int]] = {}
     for index, channel in enumerate(spec.channelnames):

@@ -200,11 +200,6 @@ def read_frame(path: str | Path) -> FrameFile:
     )
 
 
-def is_whole(path: str | Path, expected: Mapping[str, Attribute] | None = None, camera: Camera | None = None) -> bool:
-    """Return whether ``path`` is a complete, readable frame and, if given, has the ``expected`` attributes."""
-    return why_not_whole(path, expected, camera) is None
-
-
 def why_not_whole(
     path: str | Path, expected: Mapping[str, Attribute] | None = None, camera: Camera | None = None
 ) -> str | None:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_gi.color import encode_srgb
 from warp_gi.files import replacing
 
 _MIDDLE = 0.6
@@ -29,18 +30,6 @@ def tone_map(image: np.ndarray, exposure: float = 0.0) -> np.ndarray:
     x = np.clip(light * 2.0**exposure / _MIDDLE, 0, 1e6) @ _INPUT.T
     x = (x * (x + 0.0245786) - 0.000090537) / (x * (0.983729 * x + 0.4329510) + 0.238081)
     return to_bytes(encode_srgb(x @ _OUTPUT.T))
-
-
-def encode_srgb(linear: np.ndarray) -> np.ndarray:
-    """Return linear values, clipped to 0..1, in sRGB coding; the inverse of ``decode_srgb``."""
-    x = np.clip(linear, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-
-
-def decode_srgb(coded: np.ndarray) -> np.ndarray:
-    """Return sRGB-coded values 0..1 as linear ones; the inverse of ``encode_srgb``."""
-    x = np.asarray(coded, np.float64)
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
 
 
 def to_bytes(values: np.ndarray) -> np.ndarray:

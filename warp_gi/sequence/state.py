@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
@@ -27,9 +27,10 @@ class Dependence:
     """Those among them whose state no file keeps."""
 
     @property
-    def kind(self) -> str:
-        """ "independent", "saved" or "unsaved": whether frames depend on a state, and whether a file can keep it."""
-        return ("unsaved" if self.unsaved else "saved") if self.on_past else "independent"
+    def kind(self) -> Literal["independent", "saved", "unsaved"]:
+        """How a sequence can be parted: "independent" frames are the same alone and in any order; "saved" ones go on
+        from a state file; "unsaved" ones only from the first frame."""
+        return "unsaved" if self.unsaved else "saved" if self.on_past else "independent"
 
     @property
     def is_saved(self) -> bool:

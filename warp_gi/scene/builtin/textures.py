@@ -8,13 +8,11 @@ from functools import cache
 
 import numpy as np
 
+from warp_gi.color import encode_srgb
 from warp_gi.scene.model import Color, Texture
 
 SIZE = 512  # pixels
-_LINEAR = np.linspace(0, 1, 16384)
-SRGB_CODES = np.round(
-    255 * np.where(_LINEAR <= 0.0031308, 12.92 * _LINEAR, 1.055 * _LINEAR ** (1 / 2.4) - 0.055)
-).astype(np.uint8)
+SRGB_CODES = np.round(255 * encode_srgb(np.linspace(0, 1, 16384))).astype(np.uint8)
 """uint8 [16384]: sRGB codes of linear values from 0 to 1."""
 
 

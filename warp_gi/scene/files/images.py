@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_gi.errors import SceneError
+from warp_gi.errors import SceneError, one_line
 
 
 def missing_file(path: Path, what: str) -> SceneError:
@@ -48,7 +48,7 @@ def read_image(source: Path | bytes | memoryview, what: str) -> np.ndarray:
                 return np.stack([grey, grey, grey, np.full_like(grey, 255)], axis=-1)
             pixels = np.array(image.convert("RGBA"))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        reason = " ".join(str(error).split())
+        reason = one_line(error)
         raise SceneError(f"{what} cannot be read as an image ({reason}); replace or repair it") from error
     if pixels.size == 0:
         raise SceneError(f"{what} has no pixels ({pixels.shape[1]}x{pixels.shape[0]}); replace it")

@@ -21,14 +21,12 @@ from warp_gi.files import replacing
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.sequence.exr import HALF_MAX
 from warp_gi.techniques.light_field.state import baked_resolution
+from warp_gi.techniques.shared.octahedral import decode, encode, texels_of
 from warp_gi.techniques.shared.octahedral_atlas import (
     MAPPING,
     PADDING,
     PADDING_TEXT,
-    decode,
-    encode,
     padded_texels,
-    texels_of,
     warn_if_too_large,
     write_parts,
 )

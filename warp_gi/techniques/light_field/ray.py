@@ -16,7 +16,7 @@ from warp_gi.kernels import light_field_march as march_kernels
 from warp_gi.sequence.preview import tone_map
 from warp_gi.techniques.light_field.export import unpack_radiance
 from warp_gi.techniques.shared.legends import with_keys
-from warp_gi.techniques.shared.octahedral_atlas import encode, texels_of
+from warp_gi.techniques.shared.octahedral import encode, texels_of
 
 PANEL_PIXELS = 768
 """Along a side of each map that a ray is drawn in, about."""

@@ -29,6 +29,7 @@ from warp_gi.techniques.light_field.places import (
     relocate,
 )
 from warp_gi.techniques.paths.estimators import BsdfPaths
+from warp_gi.techniques.shared.octahedral import unfolded
 
 LIGHT_RESOLUTION, DISTANCE_RESOLUTION = 32, 64
 """Texels along a side of what irradiance and moments are filtered from, each the mean over the texels in it."""
@@ -56,13 +57,8 @@ def low_directions(resolution: int) -> np.ndarray:
     that the face lies over it with slope sqrt(3)) has dw = sqrt(3) dA cos / |p|^2 = dA / |p|^3, for the face's normal
     (1, 1, 1) / sqrt(3) makes the angle cos = 1 / (sqrt(3) |p|) with p.
     """
-    at = 2 * (np.arange(resolution) + 0.5) / resolution - 1
-    x, z = np.meshgrid(at, at)
-    y = 1 - np.abs(x) - np.abs(z)
-    fold = y < 0
-    sign = lambda v: np.where(v < 0, -1.0, 1.0)  # noqa: E731
-    fx, fz = np.where(fold, (1 - np.abs(z)) * sign(x), x), np.where(fold, (1 - np.abs(x)) * sign(z), z)
-    p = np.stack([fx, y, fz], axis=-1).reshape(-1, 3)
+    at = (np.arange(resolution) + 0.5) / resolution
+    p = unfolded(np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2))
     length = np.linalg.norm(p, axis=1, keepdims=True)
     return np.concatenate([p / length, (2 / resolution) ** 2 / length**3], axis=1).astype(np.float32)
 

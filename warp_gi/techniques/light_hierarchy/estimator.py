@@ -74,7 +74,7 @@ def first_tree(scene: Scene, device: wp.Device) -> TreeState | None:
     """
     if scene.emitter_count == 0:
         return None
-    bounds = light_tree.emitter_bounds(scene, scene.data(device))
+    bounds = light_tree.emitter_bounds(scene, device)
     tree = light_tree.build_tree(bounds)
     return TreeState(tree, bounds, light_tree.to_device(tree, device))
 
@@ -82,7 +82,7 @@ def first_tree(scene: Scene, device: wp.Device) -> TreeState | None:
 def moved_tree(frame: Frame, state: TreeState) -> TreeState:
     """Return the tree with its boxes and cones around the lights of a frame."""
     if frame.scene.is_animated:
-        bounds = light_tree.emitter_bounds(frame.scene, frame.data)
+        bounds = light_tree.emitter_bounds(frame.scene, frame.device)
         if not _same(bounds, state.bounds):
             tree = light_tree.refit_tree(state.tree, bounds)
             return TreeState(tree, bounds, light_tree.to_device(tree, frame.device))

@@ -15,12 +15,12 @@ import numpy as np
 import warp as wp
 
 from warp_gi.alias import AliasTable
+from warp_gi.color import LUMINANCE
 from warp_gi.errors import OptionError
 from warp_gi.kernels import light_hierarchy as kernels
 from warp_gi.kernels import types
 from warp_gi.launch import on_device
 from warp_gi.scene.scene import Scene
-from warp_gi.scene.textures import LUMINANCE
 
 LANES = kernels.LANES
 EMPTY = np.iinfo(np.int64).min
@@ -92,15 +92,11 @@ class TreeArrays:
     """float64 [number]"""
     directional_probability: float
 
-    @property
-    def level_count(self) -> int:
-        """Nodes on the longest way from the root to a light."""
-        return len(self.level_starts) - 1
 
-
-def emitter_bounds(scene: Scene, data: types.SceneData) -> EmitterBounds:
-    """Return the bounds of a scene's emitters in the pose that ``data`` is in."""
-    table = data.emitters.emitters.numpy()
+def emitter_bounds(scene: Scene, device: str | wp.Device) -> EmitterBounds:
+    """Return the bounds of a scene's emitters in the pose that its data on ``device`` are in."""
+    placed = scene.placed_emitters(device)
+    table = placed.table
     count = len(table)
     kind, flux = table["kind"], scene.emitter_powers()
     low = table["position"].astype(np.float64)
@@ -108,15 +104,12 @@ def emitter_bounds(scene: Scene, data: types.SceneData) -> EmitterBounds:
     facing, falloff = np.zeros(count), np.full(count, np.pi / 2)
     power = table["intensity"].astype(np.float64) @ LUMINANCE  # straight ahead
 
-    triangles = np.flatnonzero(kind == types.EMITTER_TRIANGLE)
-    if len(triangles):
-        faces = table["triangle"][triangles]
-        corners = data.geometry.points.numpy()[data.geometry.indices.numpy()[faces]].astype(np.float64)
-        low[triangles], high[triangles] = corners.min(axis=1), corners.max(axis=1)
-        axis[triangles] = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        both = data.materials.numpy()["double_sided"][data.geometry.materials.numpy()[faces]] != 0
-        facing[triangles[both]] = np.pi
-        power[triangles] = flux[triangles] / np.where(both, 2 * np.pi, np.pi)
+    corners, both = placed.corners, placed.two_sided
+    triangles = np.arange(len(corners))
+    low[triangles], high[triangles] = corners.min(axis=1), corners.max(axis=1)
+    axis[triangles] = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    facing[triangles[both]] = np.pi
+    power[triangles] = flux[triangles] / np.where(both, 2 * np.pi, np.pi)
     points = kind == types.EMITTER_POINT
     facing[points] = np.pi
     spots = kind == types.EMITTER_SPOT

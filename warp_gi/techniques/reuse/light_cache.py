@@ -12,7 +12,8 @@ from warp_gi import launch
 from warp_gi.alias import AliasTable
 from warp_gi.errors import OptionError, check_whole, unknown_name
 from warp_gi.estimator import Estimator
-from warp_gi.kernels import light_cache, light_cache_build, light_cache_native, types
+from warp_gi.kernels import light_cache, light_cache_build, light_cache_native
+from warp_gi.scene.emitters import PlacedEmitters
 from warp_gi.techniques.light_hierarchy.estimator import TreeState, first_tree, moved_tree
 from warp_gi.techniques.reuse.sample_octree import Lesson, SampleOctree, running_sums
 from warp_gi.techniques.shared.ltc import ltc_table
@@ -109,7 +110,7 @@ class VisibilityLightCache(Estimator):
             )
         device = launch.get_device(device)
         tree = first_tree(scene, device)
-        places, areas = _places(scene.data(device))
+        places, areas = _places(scene.placed_emitters(device))
         radiances = scene.emitter_powers() / (np.pi * np.maximum(areas, 1e-30)) * (areas > 0)
         luminances = launch.on_device(radiances.astype(np.float32), wp.float32, device)
         return CacheState(self._tables(8, device), _lists(8, device), places, tree, luminances)
@@ -122,7 +123,7 @@ class VisibilityLightCache(Estimator):
         emitters = frame.data.emitters
         moved = np.zeros(scene.emitter_count)
         if state.shapes is None or scene.is_animated:
-            places, _ = _places(frame.data)
+            places, _ = _places(scene.placed_emitters(device))
             moved = np.linalg.norm(places - state.places, axis=1)
             shapes = wp.empty(len(places), dtype=light_cache_native.LightShape, device=device)
             frame.launch(light_cache.shape_lights, [frame.data, state.luminances, shapes], len(places))
@@ -255,15 +256,12 @@ def _lists(leaves: int, device: wp.Device) -> light_cache_build.LightLists:
     return lists
 
 
-def _places(data: types.SceneData) -> tuple[np.ndarray, np.ndarray]:
+def _places(placed: PlacedEmitters) -> tuple[np.ndarray, np.ndarray]:
     """Return centre and turn of each emitter, float64 [n, 6], and the area of its emitting sides, 0 without size."""
-    table = data.emitters.emitters.numpy()
-    places = np.concatenate([table["position"], table["direction"]], axis=1).astype(np.float64)
-    areas = np.zeros(len(table))
-    has_size = table["kind"] == types.EMITTER_TRIANGLE
-    triangles = table["triangle"][has_size]
-    points = data.geometry.points.numpy()[data.geometry.indices.numpy()[triangles]].astype(np.float64)
-    places[has_size] = np.concatenate([points.mean(axis=1), points[:, 0]], axis=1)
-    areas[has_size] = np.linalg.norm(np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]), axis=1) / 2
-    areas[has_size] *= 1.0 + data.materials.numpy()["double_sided"][data.geometry.materials.numpy()[triangles]]
+    places = np.concatenate([placed.table["position"], placed.table["direction"]], axis=1).astype(np.float64)
+    areas = np.zeros(len(places))
+    points = placed.corners
+    places[: len(points)] = np.concatenate([points.mean(axis=1), points[:, 0]], axis=1)
+    sides = np.linalg.norm(np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]), axis=1) / 2
+    areas[: len(points)] = sides * (1.0 + placed.two_sided)
     return places, areas

@@ -62,6 +62,7 @@ def reuse_pictures(
     """
     with scheduler.scene.lock:
         check_pictures(scheduler, frame.camera, pixel)
+        scheduler.scene.update_sky(frame.time)
         scheduler.scene.update(frame.time, None, scheduler.device)  # others may have moved it since the frame
         return write_pngs(folder, _pictures(scheduler, frame, pixel))
 

@@ -1,4 +1,4 @@
-"""Octahedral maps for other programs: their padding and formula in NumPy, and EXR files of many maps."""
+"""Octahedral maps for other programs: their padding and formula, and EXR files of many maps."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+
+from warp_gi.errors import one_line
+from warp_gi.techniques.shared.octahedral import wrapped_texels
 
 PADDING = 1
 GPU_TEXELS = 16384
@@ -23,41 +26,13 @@ PADDING_TEXT = "One texel around each map repeats what lies across its edge on t
 
 def padded_texels(resolution: int) -> np.ndarray:
     """Return int64 [resolution + 2, resolution + 2]: the texel, row by row, that each texel of a padded map repeats."""
-    inner = np.arange(resolution**2).reshape(resolution, resolution)
-    source = np.empty((resolution + 2, resolution + 2), np.int64)
-    source[1:-1, 1:-1] = inner
-    for edge in (0, -1):
-        source[edge, 1:-1], source[1:-1, edge] = inner[edge, ::-1], inner[::-1, edge]
-        source[edge, 0], source[edge, -1] = inner[-1 - edge, -1], inner[-1 - edge, 0]
-    return source
+    at = np.arange(-PADDING, resolution + PADDING)
+    return wrapped_texels(*np.meshgrid(at, at), resolution)
 
 
 def padded(maps: np.ndarray) -> np.ndarray:
     """Return maps [..., resolution, resolution] with a border of one texel that repeats what lies across the edge."""
     return maps.reshape(*maps.shape[:-2], -1)[..., padded_texels(maps.shape[-1])]
-
-
-def encode(directions: np.ndarray) -> np.ndarray:
-    """Return coordinates in [0, 1], float [..., 2], of directions [..., 3] of any length above zero."""
-    x, y, z = np.moveaxis(0.5 * directions / np.abs(directions).sum(-1, keepdims=True), -1, 0)
-    folded = ((0.5 - np.abs(z)) * np.where(x < 0, -1, 1), (0.5 - np.abs(x)) * np.where(z < 0, -1, 1))
-    return np.stack(np.where(y < 0, folded, (x, z)), axis=-1) + 0.5
-
-
-def decode(coordinates: np.ndarray) -> np.ndarray:
-    """Return unit directions, float [..., 3], of coordinates [..., 2] in [0, 1]; the inverse of ``encode``."""
-    a, b = np.moveaxis(2 * np.asarray(coordinates) - 1, -1, 0)
-    y = 1 - np.abs(a) - np.abs(b)
-    x = np.where(y < 0, (1 - np.abs(b)) * np.where(a < 0, -1, 1), a)
-    z = np.where(y < 0, (1 - np.abs(a)) * np.where(b < 0, -1, 1), b)
-    d = np.stack([x, y, z], axis=-1)
-    return d / np.linalg.norm(d, axis=-1, keepdims=True)
-
-
-def texels_of(directions: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the column and row, int [...], of the texel that directions [..., 3] fall in."""
-    at = np.clip((encode(directions) * resolution).astype(int), 0, resolution - 1)
-    return at[..., 0], at[..., 1]
 
 
 def warn_if_too_large(name: str, width: int, height: int, advice: str) -> None:
@@ -108,5 +83,5 @@ def write_parts(
         done = done and output.write_image(np.ascontiguousarray(pixels(index) if index else first))
     done = output.close() and done
     if not done or output.has_error:
-        problem = " ".join(output.geterror().split()) or "unknown failure"
+        problem = one_line(output.geterror(), "unknown failure")
         raise OSError(f"cannot write {path}: {problem.replace(str(part), str(path))}")

@@ -16,6 +16,7 @@ from warp_gi.kernels import types
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_bake as bake_kernels
 from warp_gi.scene.geometry import surface_area
+from warp_gi.techniques.shared.octahedral import wrapped_texels
 
 DEFAULT_CELLS = 77
 """Cells along the scene's longest axis where no cell size is given; the paper's Sponza (50 cm)."""
@@ -97,16 +98,7 @@ def neighbor_table(resolution: int, dilation: int) -> np.ndarray:
     offsets = np.arange(-dilation, dilation + 1)
     i, j = np.meshgrid(np.arange(resolution), np.arange(resolution))
     dx, dy = (grid.reshape(-1) for grid in np.meshgrid(offsets, offsets))
-    columns, rows = i.reshape(-1, 1) + dx, j.reshape(-1, 1) + dy
-
-    def reflected(at: np.ndarray) -> np.ndarray:
-        return np.where(at < 0, -1 - at, np.where(at >= resolution, 2 * resolution - 1 - at, at))
-
-    rows = np.where(columns != reflected(columns), resolution - 1 - rows, rows)
-    columns = reflected(columns)
-    columns = np.where(rows != reflected(rows), resolution - 1 - columns, columns)
-    rows = reflected(rows)
-    return (rows * resolution + columns).astype(np.int32)
+    return wrapped_texels(i.reshape(-1, 1) + dx, j.reshape(-1, 1) + dy, resolution).astype(np.int32)
 
 
 def words_of(resolution: int) -> int:

@@ -25,12 +25,12 @@ from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence.frames import frame_path
 from warp_gi.sequence.preview import tone_map, write_pngs
 from warp_gi.techniques.shared.legends import exposure_of, round_above, with_keys, with_scale
+from warp_gi.techniques.shared.octahedral import texels_of
 from warp_gi.techniques.shared.octahedral_atlas import (
     MAPPING,
     PADDING,
     PADDING_TEXT,
     padded,
-    texels_of,
     warn_if_too_large,
     write_parts,
 )

@@ -1,0 +1,290 @@
+"""Sequences that go on where they stopped: which frames are there, which are to be rendered, and from which state.
+
+A frame's file is kept if it is whole and says that it was made with just the settings of this run. Where frames depend
+on those before (``Dependence``), a file also has to have come from the same frames before it: its *lineage* is a hash
+over all that decides it and them. What such a sequence knows after its last frame lies in a state file beside the
+frames; where that cannot hold everything, or does not fit, the sequence is rendered from its first frame again.
+
+Lines about what is kept, and why it is not, are logged (logger "warp_gi", level INFO).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from warp_gi.baking import load_bake
+from warp_gi.errors import BakeError, OptionError, unknown_name
+from warp_gi.files import check_writable, remove_stale_parts
+from warp_gi.scene.camera import Camera, CameraPath, frame_time
+from warp_gi.sequence.exr import Attribute
+from warp_gi.sequence.frames import (
+    frame_attributes,
+    frame_path,
+    read_frame,
+    why_not_whole,
+    write_frame,
+    write_preview,
+)
+from warp_gi.sequence.state import Dependence
+
+if TYPE_CHECKING:
+    from warp_gi.scheduler import Frame, FrameScheduler
+
+MISSING = "missing"
+PRECISIONS = ("half", "float")
+_LOG = logging.getLogger("warp_gi")
+
+
+@dataclass(frozen=True)
+class Output:
+    """Files of a sequence: where they go, and how they are stored.
+
+    Raises OptionError for a kind of file that frames cannot be, or an unknown precision.
+    """
+
+    pattern: Path
+    """An .exr or .png file; the last run of # in its name becomes the frame's number."""
+    precision: Literal["half", "float"] = "half"
+    """Storage of colours and normals in EXR files."""
+    preview: bool = False
+    """Whether a tone-mapped PNG is written beside each EXR file."""
+    exposure: float = 0.0
+    """Exposure of PNG files in stops."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pattern", Path(self.pattern))
+        if self.pattern.suffix.lower() not in (".exr", ".png"):
+            raise OptionError(f"cannot write {self.pattern.name}: frames are .exr or .png files")
+        if self.precision not in PRECISIONS:
+            raise unknown_name("precision", self.precision, PRECISIONS)
+
+    @property
+    def is_exr(self) -> bool:
+        """Whether files say how they were made, so that a sequence can be resumed."""
+        return self.pattern.suffix.lower() == ".exr"
+
+    @property
+    def state_path(self) -> Path:
+        """File beside the frames that keeps what the sequence knows after its last frame."""
+        stem = self.pattern.stem.replace("#", "").strip("._-") or "frames"
+        return self.pattern.with_name(f"{stem}.state.safetensors")
+
+    def write(self, frame: Frame, path: Path) -> None:
+        """Write the preview, then the frame: a whole frame has its preview. Raises OSError."""
+        if not self.is_exr:
+            write_preview(frame, path, self.exposure)
+            return
+        if self.preview:
+            write_preview(frame, path.with_suffix(".png"), self.exposure)
+        write_frame(frame, path, self.precision)
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A frame of a sequence, and where it goes."""
+
+    index: int
+    previous: int
+    """Number of the frame that motion is towards."""
+    path: Path
+    time: float
+    """Time in seconds."""
+    camera: Camera
+    previous_camera: Camera
+    lineage: str = ""
+    """Hash of all that decides this frame and those before it; "" where it does not depend on them."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is left to do of a sequence."""
+
+    shots: tuple[Shot, ...]
+    """All frames that were asked for, in order."""
+    todo: tuple[Shot, ...]
+    """Frames to render, in order."""
+    problems: Mapping[int, str] = field(default_factory=dict)
+    """Reason, by frame number, why a file cannot be kept: "missing", "not whole", "seed is 1 instead of 2"."""
+    restart: str = ""
+    """Reason why the sequence is rendered from its first frame though some are there; "" if it is not."""
+    dependence: Dependence = Dependence((), ())
+    """How frames depend on those before."""
+
+    @property
+    def done(self) -> tuple[Shot, ...]:
+        """Frames that are kept, in order."""
+        wanted = {shot.index for shot in self.todo}
+        return tuple(shot for shot in self.shots if shot.index not in wanted)
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """Numbers of the frames to render, in order."""
+        return tuple(shot.index for shot in self.todo)
+
+    @property
+    def missing(self) -> tuple[int, ...]:
+        """Numbers of the frames without a file, in order."""
+        return tuple(index for index, problem in self.problems.items() if problem == MISSING)
+
+    def reason(self, index: int) -> str:
+        """Return in words why frame ``index`` is rendered; "" for one that is kept, or was not asked for."""
+        if index not in self.frames:
+            return ""
+        if index in self.problems or self.restart or not self.problems:
+            return self.problems.get(index) or self.restart or "files that are there are not to be kept"
+        numbers = [shot.index for shot in self.shots]
+        is_after = numbers.index(index) > numbers.index(next(iter(self.problems)))
+        return "a frame before it is rendered again" if is_after else "the saved state is of a frame before it"
+
+
+def shots_of(camera: Camera | CameraPath, frames: Sequence[int], pattern: str | Path) -> list[Shot]:
+    """Return frames of a camera in order, each with the file that it goes to.
+
+    Raises OptionError for a negative number, or several frames that would go to one file.
+    """
+    pattern = Path(pattern)
+    if len(frames) > 1 and "#" not in pattern.name:
+        raise OptionError(f"{len(frames)} frames cannot all go to {pattern}; put #### in the name")
+    at = camera.camera if isinstance(camera, CameraPath) else lambda index: camera
+    previous = [max(frames[0] - 1, 0), *frames] if frames else []
+    return [
+        Shot(index, before, frame_path(pattern, index), frame_time(camera, index), at(index), at(before))
+        for index, before in zip(frames, previous, strict=False)
+    ]
+
+
+class SequenceRun:
+    """Renders a sequence to files: plan first, then ``prepare``, then ``render`` and ``save_state`` frame by frame.
+
+    Args:
+        scheduler: What renders; it has rendered no frame yet.
+        shots: The frames, in order.
+        output: Where their files go.
+    """
+
+    def __init__(self, scheduler: FrameScheduler, shots: Sequence[Shot], output: Output) -> None:
+        self.scheduler, self.shots, self.output = scheduler, tuple(shots), output
+
+    def bake(self) -> None:
+        """Bake under the sky of the first frame, whichever of them will be rendered: resumed or not, it is the same."""
+        with self.scheduler.scene.lock:
+            self.scheduler.scene.update_sky(self.shots[0].time)
+            self.scheduler.bake()
+
+    @cached_property
+    def dependence(self) -> Dependence:
+        """How the frames depend on those before."""
+        self.bake()
+        return self.scheduler.dependence([shot.index for shot in self.shots])
+
+    def plan(self, resume: bool = True) -> Plan:
+        """Return which frames are to be rendered; the scheduler then goes on from the saved state, if one is needed.
+
+        Without ``resume`` that is every frame. Raises OptionError for files that do not say how they were made.
+        """
+        if resume and not self.output.is_exr:
+            raise OptionError("resume needs .exr files, which say how they were made; a .png does not")
+        dependence, shots, problems, lineage = self.dependence, [], {}, ""
+        for shot in self.shots:
+            if dependence.on_past:
+                lineage = self._lineage(shot, lineage)
+                shot = replace(shot, lineage=lineage)
+            shots.append(shot)
+            problem = why_not_whole(shot.path, self._attributes(shot), shot.camera) if resume else None
+            if problem is not None:
+                problems[shot.index] = problem
+        if not resume:
+            return Plan(tuple(shots), tuple(shots), dependence=dependence)
+        for shot in shots:
+            if problems.get(shot.index, MISSING) != MISSING:
+                _LOG.info("%s is rendered again: %s", shot.path, problems[shot.index])
+        todo, restart = [shot for shot in shots if shot.index in problems], ""
+        if todo and len(todo) < len(shots) and dependence.on_past:
+            gap = next(place for place, shot in enumerate(shots) if shot.index in problems)
+            todo = shots[self._load_state(shots[:gap]) :]
+            if len(todo) == len(shots):
+                restart = _why_restart(dependence)
+                _LOG.info("every frame is rendered again: %s", restart)
+        return Plan(tuple(shots), tuple(todo), problems, restart, dependence)
+
+    def prepare(self, plan: Plan) -> None:
+        """Write previews that kept frames lack, make the folder, and remove what a killed run left there.
+
+        Raises OSError now, not after an hour's work, if nothing can be written.
+        """
+        for shot in plan.done:
+            preview = shot.path.with_suffix(".png")
+            if self.output.preview and not preview.exists():
+                write_preview(read_frame(shot.path), preview, self.output.exposure)
+        if plan.todo:
+            check_writable(self.output.pattern.parent)
+            remove_stale_parts(self.output.state_path)
+        if plan.done:
+            _LOG.info("%d of %d frames are there already", len(plan.done), len(plan.shots))
+
+    def render(self, shot: Shot) -> Frame:
+        """Render a frame of the plan's ``todo`` and write its file; the time it took is the frame's timing "write"."""
+        remove_stale_parts(shot.path)
+        frame = self.scheduler.frame(shot.index, shot.previous)
+        if shot.lineage:
+            frame.metadata["lineage"] = shot.lineage
+        started = time.perf_counter()
+        self.output.write(frame, shot.path)
+        frame.timings["write"] = time.perf_counter() - started
+        return frame
+
+    def save_state(self, shot: Shot, frame: Frame) -> None:
+        """Save what is known after a frame, if later ones depend on it and a file can hold it all.
+
+        Seconds are added to the frame's timings as "save state".
+        """
+        if self.dependence.is_saved and self.output.is_exr:  # nothing resumes from other files
+            started = time.perf_counter()
+            self.scheduler.save_state(self.output.state_path, shot.lineage)
+            frame.timings["save state"] = time.perf_counter() - started
+
+    def _attributes(self, shot: Shot) -> dict[str, Attribute]:
+        """Return what a frame's file has to say, under the sky of that frame."""
+        with self.scheduler.scene.lock:
+            self.scheduler.scene.update_sky(shot.time)
+            metadata = self.scheduler.metadata()
+        if shot.lineage:
+            metadata = metadata | {"lineage": shot.lineage}
+        return frame_attributes(
+            shot.index, shot.time, shot.camera, metadata, shot.previous_camera, self.output.precision
+        )
+
+    def _lineage(self, shot: Shot, before: str) -> str:
+        """Return a hash of all that decides a frame and those before it, whose hash is ``before``."""
+        attributes = self._attributes(replace(shot, lineage=""))
+        return hashlib.sha256(f"{before}{shot.camera.resolution}{attributes}".encode()).hexdigest()
+
+    def _load_state(self, whole: Sequence[Shot]) -> int:
+        """Let the scheduler go on from a saved state; return after how many of the first frames, which are whole."""
+        path = self.output.state_path
+        if not (self.dependence.is_saved and whole and path.exists()):
+            return 0
+        lineages = [shot.lineage for shot in whole]
+        try:
+            known = load_bake(path).settings.get("lineage")
+            if known not in lineages:
+                return 0
+            self.scheduler.load_state(path, known)
+        except BakeError:  # damaged, or of other settings
+            return 0
+        return lineages.index(known) + 1
+
+
+def _why_restart(dependence: Dependence) -> str:
+    """Return why every frame is rendered again where some are there already."""
+    words = {"denoiser": "the denoiser"}
+    names = [words.get(name, f"the {name} light") for name in dependence.unsaved or dependence.on_past]
+    reason = "" if dependence.unsaved else "no saved state fits, and "
+    return f"{reason}{' and '.join(names)} depend{'s' * (len(names) == 1)} on the frames before"

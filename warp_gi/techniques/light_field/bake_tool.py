@@ -1,0 +1,103 @@
+"""``warp-gi bake`` of light field probes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from warp_gi.baking import Bake
+from warp_gi.errors import OptionError
+from warp_gi.scene.camera import Camera
+from warp_gi.scene.scene import Scene
+from warp_gi.techniques.bake_tool import BakeTool, Rows, Table, times
+from warp_gi.techniques.light_field import export as export_files
+from warp_gi.techniques.light_field import pictures
+from warp_gi.techniques.light_field.estimator import LightFieldProbes
+from warp_gi.techniques.light_field.places import probe_grid
+from warp_gi.techniques.light_field.state import baked_resolution, bounce_changes
+
+
+class LightFieldTool(BakeTool):
+    """Bakes the whole grid of probes, placed by the camera path or by where light is."""
+
+    settings = LightFieldProbes
+    summary = (
+        "The light all around each point of a grid, under the scene's sky, over the space that",
+        "paths from the camera reach, wherever it goes.",
+    )
+    shows = ("their maps, their places in the view, and the path of a ray through the maps",)
+    exports = ("atlases NAME.radiance.exr and so on for NAME.exr",)
+    examples = (
+        "hall.glb --environment city.exr --counts 4 4 4",
+        "atrium --export out/a.exr --show out/atrium_probes",
+    )
+    exported = "atlases"
+    finds_places = True
+
+    def check(self, settings: LightFieldProbes, everywhere: bool) -> None:
+        """Raise OptionError for a way to render, or for all of a scene."""
+        if everywhere:
+            raise OptionError(
+                "--everywhere goes with visibility fields; a bake of probes is always of the whole grid: omit it"
+            )
+        if settings.primary == "probes":
+            raise OptionError(
+                'primary "probes" is a way to render; bake without it, then warp-gi render FILE shows the bake'
+            )
+
+    def check_scene(self, settings: LightFieldProbes, scene: Scene) -> None:
+        """Raise OptionError for too many probes, where their counts are given; else the bake finds out."""
+        if all(settings.counts):
+            probe_grid(scene.bounds, settings.counts, settings.spacing, settings.largest_map)
+
+    def check_export_name(self, path: Path) -> None:
+        """Raise OptionError unless the file is an .exr."""
+        export_files.check_export_name(path)
+
+    def export(self, bake: Bake, path: Path) -> list[Path]:
+        """Write the maps as atlases."""
+        return export_files.export_atlases(bake, path)
+
+    def write_pictures(
+        self, scene: Scene, camera: Camera, bake: Bake, settings: LightFieldProbes, folder: Path, device: str, seed: int
+    ) -> list[Path]:
+        """Write the maps, the places of probes, and the path of a ray."""
+        return pictures.write_pictures(scene, camera, bake, settings, folder, device, seed)
+
+    def rows(self, bake: Bake, seconds: float) -> Rows:
+        """Return counts of probes, texels and rays, how fast they were, and what bounces changed."""
+        counts, settings, changes = bake.counts, bake.settings, bounce_changes(bake)
+        size, few = baked_resolution(bake), int(settings["irradiance_resolution"])
+        return [
+            ("probes", int(counts["probes"])),
+            ("probes usable", int(counts["probes"] - counts["covered"])),
+            ("probes covered", int(counts["covered"])),
+            ("grid", times(bake.arrays["grid_counts"])),
+            ("spacing [m]", times(f"{step:.3g}" for step in bake.arrays["grid_spacing"])),
+            ("map of a probe", f"{size} x {size}"),
+            ("map of irradiance", f"{few} x {few}"),
+            ("texels", int(counts["probes"]) * size**2),
+            ("rays", int(counts["rays"])),
+            ("seconds", round(seconds, 3)),
+            ("million rays a second", counts["rays"] / 1e6 / max(seconds, 1e-9)),
+            ("bounces", len(changes)),
+            ("change of the last", changes[-1]),
+            ("maps in memory [MB]", counts["bytes"] / 1e6),
+        ]
+
+    def tables(self, bake: Bake) -> list[Table]:
+        """Return what each bounce changed."""
+        rows = list(enumerate(bounce_changes(bake), 1))
+        return [Table("light that bounces", ("bounce", "change of the irradiance"), rows)]
+
+    def advice(self, bake: Bake, settings: LightFieldProbes) -> str:
+        """Return that light needs more bounces, if it does."""
+        last = bounce_changes(bake)[-1]
+        if not settings.tolerance or last <= settings.tolerance:
+            return ""
+        return (
+            f"the last bounce still changed {last:.2g} of the light, more than the tolerance of "
+            f"{settings.tolerance:g}: give more --bounces than {settings.bounces}"
+        )
+
+
+TOOL = LightFieldTool()
