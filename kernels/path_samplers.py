@@ -19,6 +19,7 @@ from warp_gi.kernels.environment import (
     EnvironmentSample,
     environment_lookup,
     environment_prefetch,
+    environment_radiance,
     environment_sample,
 )
 from warp_gi.kernels.sampling import sample_1d, sample_2d
@@ -76,7 +77,7 @@ class Sky(NamedTuple):
     One thread at a time follows the paths of one item, in order, so `leave` may add to arrays at a place that follows
     from the path's number, without atomics. In ``trace_paths`` path = item * PathSettings.spp + sample, item being
     that of ``gbuffer.tiled_pixel``; whoever calls ``trace_path`` numbers paths as it likes, NO_PATH records nothing.
-    Light that a camera ray sees of the sky is no path's, and not recorded. A recorder that has no use for emitters
+    What a camera ray sees of the sky is no path's, and not recorded. A recorder that has no use for emitters
     takes them out of its SceneData (count = 0), or paths sample them in vain.
     """
 
@@ -89,6 +90,7 @@ class Sky(NamedTuple):
     prefetch: wp.Function  # (data, scene, u: vec3): called ahead of `sample` with the same numbers
     sample: wp.Function  # (data, scene, u: vec3) -> EnvironmentSample
     lookup: wp.Function  # (data, scene, direction) -> EnvironmentLookup, whose pdf is that of `sample`
+    radiance: wp.Function  # (data, scene, direction) -> that of `lookup` alone, for camera rays that hit nothing
     # (data, path: int64, edges of the path from the camera to the sky: 2 is direct light, direction, weight: vec3)
     leave: wp.Function
 
@@ -280,6 +282,11 @@ def scene_sky_lookup(data: SceneSky, scene: SceneData, direction: wp.vec3) -> En
     return environment_lookup(scene.environment, direction)
 
 
+@wp.func
+def scene_sky_radiance(data: SceneSky, scene: SceneData, direction: wp.vec3) -> wp.vec3:
+    return environment_radiance(scene.environment, direction)
+
+
 # For skies that keep no record.
 @wp.func
 def leave_no_record(data: Any, path: wp.int64, edges: wp.int32, direction: wp.vec3, weight: wp.vec3):
@@ -309,6 +316,7 @@ SCENE_SKY = Sky(
     scene_sky_prefetch,
     scene_sky_sample,
     scene_sky_lookup,
+    scene_sky_radiance,
     leave_no_record,
 )
 NO_CACHE = PathCache("none", NoCache, nothing_known)

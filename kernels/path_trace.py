@@ -363,7 +363,7 @@ def _made(
         direction = hits.direction[pixel]
         count = wp.float32(settings.sample_count)
         if face < 0:
-            background = sky.lookup(samplers.sky, scene, direction).radiance
+            background = sky.radiance(samplers.sky, scene, direction)
             buffers.moment1[pixel] = buffers.moment1[pixel] + background * count
             buffers.moment2[pixel] = buffers.moment2[pixel] + wp.cw_mul(background, background) * count
             return

@@ -81,6 +81,11 @@ def transfer_lookup(data: Transfer, scene: SceneData, direction: wp.vec3) -> Env
 
 
 @wp.func
+def transfer_radiance(data: Transfer, scene: SceneData, direction: wp.vec3) -> wp.vec3:
+    return wp.vec3(0.0, 0.0, 0.0)
+
+
+@wp.func
 def transfer_leave(data: Transfer, path: wp.int64, edges: wp.int32, direction: wp.vec3, weight: wp.vec3):
     item = wp.int32(path / wp.int64(data.paths))
     y = harmonics(direction)
@@ -99,6 +104,7 @@ TRANSFER_SKY = Sky(
     transfer_prefetch,
     transfer_sample,
     transfer_lookup,
+    transfer_radiance,
     transfer_leave,
 )
 RECORDER = path_tracer(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, TRANSFER_SKY)
