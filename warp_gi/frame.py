@@ -16,7 +16,8 @@ from warp_gi import launch
 from warp_gi.errors import unknown_name
 from warp_gi.kernels import denoise, gbuffer, path_samplers, path_trace, types
 from warp_gi.paths import PathRequest, sky_probability
-from warp_gi.scene.camera import Camera, camera_data
+from warp_gi.scene.camera import Camera
+from warp_gi.scene.pinhole import camera_data
 
 if TYPE_CHECKING:
     from warp_gi.scene.baked import BakedScene

@@ -40,7 +40,8 @@ def render(
 ) -> Iterator[Frame]:
     """Yield the frames of a sequence, and write them to files if there is an ``output``.
 
-    A file is there, whole, before its frame is yielded. Without ``resume`` all frames are rendered, whatever files
+    Each frame is rendered when it is asked for, so iterate over all of them even if only the files matter. A file is
+    there, whole, before its frame is yielded. Without ``resume`` all frames are rendered, whatever files
     there are. With it, frames whose files are whole and were made with just these settings are neither rendered nor
     yielded: ``gi.read_frame`` reads them, and ``gi.plan_sequence`` tells beforehand which they are. Where frames depend
     on those before, what is learnt is saved beside them after each frame (NAME.state.safetensors), and a resumed

@@ -27,7 +27,7 @@ def setup_of(pipeline: str, folder: Path, arguments: Sequence[str]) -> tuple[Row
 
 def main(arguments: Sequence[str]) -> int:
     """Set up the pipeline, render its first frame, and print what that took."""
-    from warp_gi.cli.bench_compare import parse
+    from warp_gi.cli.compare_options import parse
 
     try:
         print(json.dumps(_measured(arguments[0], Path(arguments[1]), parse(arguments[2:]))))
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _measured(name: str, folder: Path, options: object) -> Row:
-    from warp_gi.cli.bench_compare import inputs_of, start
+    from warp_gi.cli.compare_options import inputs_of, start
 
     start(options)
     given, load = timed(lambda: inputs_of(options))

@@ -12,7 +12,10 @@ from PIL import Image
 
 import warp_gi as gi
 from warp_gi import launch
+from warp_gi.cli import bake as bake_command
 from warp_gi.cli import main as cli
+from warp_gi.cli.bake import BAKEABLE, default_output, tool_of
+from warp_gi.cli.bake import parse as parse_bake
 from warp_gi.cli.render import parse
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels.octahedral import octahedral_decode, octahedral_wrap
@@ -444,6 +447,26 @@ def test_probes_need_no_camera_and_settled_light_no_advice(tmp_path, capsys, mon
     assert cli.main([*command, "--show", "pictures"]) == 0
     assert "the scene has no camera: showing all of it" in capsys.readouterr().out
     assert (tmp_path / "pictures" / "places.png").exists() and (tmp_path / "out" / "floor.probes.safetensors").exists()
+
+
+@pytest.mark.parametrize("name", BAKEABLE)
+def test_a_technique_has_a_long_and_a_short_name(name, tmp_path, monkeypatch):
+    one = BAKEABLE[name]
+    for given in (name, one.short):
+        options = parse_bake(["cornell_box", "--technique", given])
+        assert (options.technique, type(options.settings)) == (name, tool_of(name).settings)
+        assert default_output(options).name == f"cornell_box.{one.short}.safetensors"
+
+
+def test_what_the_help_says_of_techniques_comes_from_their_tools():
+    text = bake_command.DESCRIPTION + "".join(Path(bake_command.__file__).read_text().split("class BakeOptions")[1:])
+    words = {word for name, one in BAKEABLE.items() for word in (name, one.short, tool_of(name).settings.__name__)}
+    assert not [word for word in {*words, "visibility field", "probes", "Probes"} if word in text]
+    for name, one in BAKEABLE.items():
+        tool = tool_of(name)
+        lines = [*tool.summary, *tool.shows, *tool.exports, *(example.split(" ", 1)[1] for example in tool.examples)]
+        told = bake_command.description()
+        assert f"  {name}, {one.short} " in told and all(line in told for line in lines)
 
 
 def test_help(capsys):

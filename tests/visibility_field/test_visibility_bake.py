@@ -19,7 +19,7 @@ from warp_gi.kernels import visibility_field_audit as auditing
 from warp_gi.kernels import visibility_field_bake as baking
 from warp_gi.kernels.bvh import bvh_occluded, bvh_occluder
 from warp_gi.launch import launch, set_threads
-from warp_gi.scene.camera import camera_data
+from warp_gi.scene.pinhole import camera_data
 from warp_gi.techniques.visibility_field import bake as visibility_bake
 from warp_gi.techniques.visibility_field.bake import FieldBaker, Grid, field_query, grid_of, neighbor_table, words_of
 from warp_gi.techniques.visibility_field.state import FieldState

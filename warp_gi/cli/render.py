@@ -32,7 +32,7 @@ from warp_gi.pipeline import Pipeline
 from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.camera import STILL_FPS, Camera, CameraPath
 from warp_gi.scene.scene import Scene
-from warp_gi.scene.turning_sky import TurningSky
+from warp_gi.scene.sky_motion import TurningSky
 from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence.frames import parse_frames
 from warp_gi.sequence.resume import Output, Plan, SequenceRun, Shot, shots_of

@@ -16,14 +16,14 @@ from warp_gi.launch import on_device
 from warp_gi.scene import animation, emitters, geometry, textures
 
 if TYPE_CHECKING:
+    from warp_gi.scene.contents import SceneContents
     from warp_gi.scene.environment import Environment
-    from warp_gi.scene.scene import Scene
 
 
 class DeviceScene:
     """The buffers of a scene on one device, and the pose they are in."""
 
-    def __init__(self, scene: Scene, device: wp.Device) -> None:
+    def __init__(self, scene: SceneContents, device: wp.Device) -> None:
         from warp_gi.bvh import TriangleBvh
         from warp_gi.scene.masks import alpha_masks
 

@@ -20,7 +20,7 @@ from warp_gi.scene.model import Material, Mesh, Node, PunctualLight, Texture
 from warp_gi.scene.watching import Change, Watch
 
 if TYPE_CHECKING:
-    from warp_gi.scene.scene import Scene
+    from warp_gi.scene.contents import SceneContents
 
 NEW_SCENE = "make a new scene: gi.Scene(scene.nodes, scene.lights, scene.environment, scene.cameras)"
 NEW_SKY = "assign it again: scene.environment = ..."
@@ -46,7 +46,7 @@ class _Slot(NamedTuple):
 class Edits:
     """What a scene was made from; made anew whenever the scene reads its nodes again."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: SceneContents) -> None:
         self.scene = scene
         self.nodes = list(scene.nodes)
         self.slots = _slots(scene)
@@ -290,20 +290,20 @@ class Edits:
         return None
 
 
-def _geometry(scene: Scene) -> list[Any]:
+def _geometry(scene: SceneContents) -> list[Any]:
     """Return what the flat geometry of a scene is made from."""
     meshes = {id(mesh): mesh for node in scene.nodes for mesh in node.meshes}
     return [(scene, ("nodes", "materials")), *scene.nodes, *meshes.values()]
 
 
-def _shading(scene: Scene) -> list[Any]:
+def _shading(scene: SceneContents) -> list[Any]:
     """Return materials, textures and lights of a scene."""
     used = [*scene.materials, *(mesh.material for node in scene.nodes for mesh in node.meshes)]
     materials = list({id(material): material for material in used}.values())
     return [(scene, ("lights", "materials")), *materials, *textures.distinct_textures(materials), *scene.lights]
 
 
-def _slots(scene: Scene) -> list[list[_Slot]]:
+def _slots(scene: SceneContents) -> list[list[_Slot]]:
     """Return for each node where its meshes lie in the flat geometry."""
     rows = {id(material): row for row, material in enumerate(scene.materials)}
     vertex = triangle = 0
@@ -354,7 +354,7 @@ def _alike(a: Material, b: Material) -> bool:
     )
 
 
-def _are_lights_read_anew(scene: Scene) -> bool:
+def _are_lights_read_anew(scene: SceneContents) -> bool:
     """Return whether every frame reads all punctual lights, because one of them moves."""
     moving = scene._moving
     return any(light.node is not None and light.node < len(moving) and moving[light.node] for light in scene.lights)

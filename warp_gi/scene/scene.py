@@ -18,10 +18,11 @@ from warp_gi.scene import animation, emitters, geometry, textures
 from warp_gi.scene.device_scene import DeviceScene
 from warp_gi.scene.edits import Edits
 from warp_gi.scene.model import Keyframe, Material, Node, PunctualLight
+from warp_gi.scene.sky_motion import appearance, as_sky, sky_at_time
 
 if TYPE_CHECKING:
-    from warp_gi.scene.camera import Camera
     from warp_gi.scene.environment import Environment
+    from warp_gi.scene.pinhole import Camera
 
 POSES_FOR_BOUNDS = 33
 """Evenly spaced poses, beside those of the keyframes, that the bounds of an animated scene enclose."""
@@ -113,7 +114,7 @@ class Scene:
     @environment.setter
     def environment(self, value: Any) -> None:
         sky_at = value if callable(value) and not isinstance(value, type) else None
-        sky = _as_sky(value) if sky_at is None else _sky_at(sky_at, 0.0)
+        sky = as_sky(value) if sky_at is None else sky_at_time(sky_at, 0.0)
         with self.lock:
             self._sky_at, self._sky_time = sky_at, 0.0
             self._show(sky)
@@ -131,8 +132,8 @@ class Scene:
         with self.lock:
             if self._sky_at is None or time == self._sky_time:
                 return False
-            self._sky_time, sky = None, _sky_at(self._sky_at, time)
-            is_other = _appearance(sky) != self._sky_shown
+            self._sky_time, sky = None, sky_at_time(self._sky_at, time)
+            is_other = appearance(sky) != self._sky_shown
             if is_other:
                 self._show(sky)
             self._sky_time = time
@@ -147,7 +148,7 @@ class Scene:
             device_scene.set_environment(sky)
         if self._devices:
             self._edits.sky_in_use()
-        self._sky_shown = _appearance(sky) if self._sky_at is not None else None
+        self._sky_shown = appearance(sky) if self._sky_at is not None else None
 
     @property
     def triangle_count(self) -> int:
@@ -368,25 +369,6 @@ class Scene:
                     for mesh in node.meshes if moving else ():
                         boxes.extend(geometry.transform_points(matrix, _box_corners(mesh)))
         return np.stack([np.min(boxes, axis=0), np.max(boxes, axis=0)]).astype(np.float32)
-
-
-def _as_sky(value: Any) -> Environment | None:
-    """Return an environment from what ``Scene.environment`` takes, or None."""
-    from warp_gi.scene.environment import as_environment
-
-    return None if value is None else as_environment(value)
-
-
-def _sky_at(sky_at: Callable[[float], Any], time: float) -> Environment | None:
-    """Return what a function of time says the sky is; a SceneError of it tells the time."""
-    try:
-        return _as_sky(sky_at(time))
-    except SceneError as error:
-        raise SceneError(f"the sky at {time:g} s: {error}") from error
-
-
-def _appearance(sky: Environment | None) -> tuple[Any, ...] | None:
-    return None if sky is None else sky.appearance
 
 
 def _box_corners(mesh: Any) -> np.ndarray:

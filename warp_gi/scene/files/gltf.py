@@ -18,12 +18,12 @@ from pygltflib import GLTF2
 
 from warp_gi.errors import SceneError
 from warp_gi.scene.animation import moving_nodes, pose_matrix, world_matrices
-from warp_gi.scene.camera import Camera
 from warp_gi.scene.files.gltf_animation import read_keyframes
 from warp_gi.scene.files.gltf_buffers import Buffers, split_glb
 from warp_gi.scene.files.gltf_materials import MaterialReader, texture_transform
 from warp_gi.scene.files.parts import SceneParts
 from warp_gi.scene.model import Mesh, Node, PunctualLight
+from warp_gi.scene.pinhole import Camera
 
 KNOWN_EXTENSIONS = {
     "KHR_lights_punctual",

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from warp_gi.scene.camera import Camera
 from warp_gi.scene.model import Mesh, Node, PunctualLight
 from warp_gi.scene.normals import smooth_mesh
+from warp_gi.scene.pinhole import Camera
 
 
 @dataclass(eq=False)

@@ -20,7 +20,8 @@ from warp_gi.errors import OptionError
 from warp_gi.kernels import light_field_place as kernels
 from warp_gi.kernels import types
 from warp_gi.paths import sky_probability
-from warp_gi.scene.camera import Camera, CameraPath, camera_data
+from warp_gi.scene.camera import Camera, CameraPath
+from warp_gi.scene.pinhole import camera_data
 
 AUTOMATIC_PROBES = 440
 """Most that there are where neither counts nor spacing are given."""

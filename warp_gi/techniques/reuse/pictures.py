@@ -16,7 +16,8 @@ from warp_gi.frame import Frame
 from warp_gi.kernels import reuse_pictures as kernels
 from warp_gi.kernels import types
 from warp_gi.paths import sky_probability
-from warp_gi.scene.camera import Camera, camera_data
+from warp_gi.scene.camera import Camera
+from warp_gi.scene.pinhole import camera_data
 from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence.preview import magma, to_bytes, write_pngs
 from warp_gi.techniques.light_field.ray import probe_color

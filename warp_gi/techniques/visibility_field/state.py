@@ -25,7 +25,8 @@ from warp_gi.errors import BakeError
 from warp_gi.kernels import gbuffer
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_bake as bake_kernels
-from warp_gi.scene.camera import Camera, CameraPath, camera_data
+from warp_gi.scene.camera import Camera, CameraPath
+from warp_gi.scene.pinhole import camera_data
 from warp_gi.scene.scene import Scene
 from warp_gi.techniques.visibility_field.bake import FieldBaker, Grid, grid_of, grid_struct, words_of
 

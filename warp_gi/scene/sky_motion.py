@@ -1,8 +1,9 @@
-"""Skies that turn: functions of time, for ``scene.environment``."""
+"""Skies as functions of time, for ``scene.environment``."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,3 +43,21 @@ class TurningSky:
         if abs(steps - whole) <= ROUNDING * max(abs(steps), 1.0):
             steps = whole  # the time of a frame: its angle must not depend on fps
         return self.sky.rotated(math.fmod(steps * self.degrees, 360.0))
+
+
+def as_sky(value: Any) -> Environment | None:
+    """Return an environment from what ``Scene.environment`` takes beside functions of time."""
+    return None if value is None else as_environment(value)
+
+
+def sky_at_time(sky_at: Callable[[float], Any], time: float) -> Environment | None:
+    """Return what a function of time says the sky is; a SceneError about it tells the time."""
+    try:
+        return as_sky(sky_at(time))
+    except SceneError as error:
+        raise SceneError(f"the sky at {time:g} s: {error}") from error
+
+
+def appearance(sky: Environment | None) -> tuple[Any, ...] | None:
+    """Return all that decides how a sky looks, to compare it with another."""
+    return None if sky is None else sky.appearance

@@ -1,0 +1,63 @@
+"""What the buffers on devices, and the watch over edits, know of a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from warp_gi.scene.geometry import FlatGeometry
+from warp_gi.scene.model import Material, Node, PunctualLight
+
+if TYPE_CHECKING:
+    from warp_gi.scene.environment import Environment
+
+
+class SceneContents(Protocol):
+    """A ``Scene``, as those see it that it is made of."""
+
+    name: str
+    nodes: list[Node]
+    lights: list[PunctualLight]
+    materials: list[Material]
+    _devices: Mapping[str, Any]
+    """Buffers by device (``DeviceScene``)."""
+    _flat: FlatGeometry
+    """Copy of the geometry of all nodes, at time 0."""
+    _emissive: np.ndarray
+    """Indices of the triangles that emit."""
+    _moving: Sequence[bool]
+    """Whether each node moves."""
+    _world: Sequence[np.ndarray]
+    """Placement of each node at time 0, float64 [4, 4]."""
+
+    @property
+    def environment(self) -> Environment | None:
+        """The sky now."""
+        ...
+
+    @property
+    def is_animated(self) -> bool:
+        """Whether any node moves."""
+        ...
+
+    @property
+    def triangle_count(self) -> int:
+        """Number of triangles."""
+        ...
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Lowest and highest corner, float32 [2, 3], metres."""
+        ...
+
+    @property
+    def radius(self) -> float:
+        """Half the diagonal of the bounds, metres."""
+        ...
+
+    @property
+    def moving_objects(self) -> dict[int, int]:
+        """Node of each object (by object id) that can move."""
+        ...
