@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import pytest
 import statistics_tools as st
 import warp as wp
 from statistics_tools import every_device  # noqa: F401
+from truth_tools import MATERIALS, albedo, gltf, unit
 
 from warp_gi.kernels.bsdf import average_reflectance, average_specular, bsdf_evaluate, bsdf_sample, make_bsdf
 from warp_gi.kernels.sampling import cosine_direction, sample_1d, sample_2d, triangle_barycentrics
@@ -16,15 +15,6 @@ from warp_gi.launch import launch
 
 wp.set_module_options({"enable_backward": False})
 
-MATERIALS = {  # base colour, metallic, roughness, specular
-    "lambert": ((0.8, 0.5, 0.2), 0.0, 1.0, 0.0),
-    "plastic": ((0.8, 0.5, 0.2), 0.0, 0.3, 1.0),
-    "half_specular": ((0.9, 0.9, 0.9), 0.0, 0.6, 0.5),
-    "rough_metal": ((0.9, 0.6, 0.3), 1.0, 0.8, 1.0),
-    "smooth_metal": ((1.0, 1.0, 1.0), 1.0, 0.2, 1.0),
-    "mixed": ((0.2, 0.9, 0.4), 0.5, 0.5, 1.0),
-    "black_metal": ((0.0, 0.0, 0.0), 1.0, 0.5, 1.0),
-}
 VIEWS = {"normal": (0.0, 0.0, 1.0), "oblique": (0.6, 0.2, 0.77), "grazing": (-0.3, 0.94, 0.15)}
 
 
@@ -99,11 +89,6 @@ def parameters(name: str) -> np.ndarray:
     return np.array([*base, *rest], dtype=np.float32)
 
 
-def unit(v: object) -> np.ndarray:
-    v = np.asarray(v, dtype=np.float64)
-    return v / np.linalg.norm(v, axis=-1, keepdims=True)
-
-
 def evaluate(name: str, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
     """Return f * cos and pdf, float32 [n, 4], from the kernel."""
     wo, wi = (np.ascontiguousarray(np.broadcast_to(d, wi.shape), dtype=np.float32) for d in (wo, wi))
@@ -121,41 +106,6 @@ def sample(name: str, wo: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarra
     launch(sample_bsdf, count, [material, wp.vec3(*wo), wi, weight], st.device())
     weight = weight.numpy()
     return np.where(weight[:, 3:] > 0, wi.numpy(), 0.0), weight
-
-
-def gltf(name: str, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
-    """BSDF times cosine, float64 [n, 3], as glTF 2.0 Appendix B and KHR_materials_specular state it."""
-    base, metallic, roughness, specular = MATERIALS[name]
-    base = np.asarray(base)
-    alpha2 = max(roughness**2, 1e-3) ** 2
-    half = unit(wo + wi)
-    n_h, v_h, n_l, n_v = half[:, 2], (wi * half).sum(-1), wi[:, 2], np.broadcast_to(wo, wi.shape)[:, 2]
-    d = alpha2 / (np.pi * (n_h**2 * (alpha2 - 1.0) + 1.0) ** 2)
-    v = 0.5 / (n_l * np.sqrt(n_v**2 * (1 - alpha2) + alpha2) + n_v * np.sqrt(n_l**2 * (1 - alpha2) + alpha2))
-    f0 = 0.04 * specular * (1 - metallic) + base * metallic
-    f90 = specular * (1 - metallic) + metallic
-    f = f0 + (f90 - f0) * (1 - v_h[:, None]) ** 5
-    value = (1 - f) * base * (1 - metallic) / np.pi + f * (d * v)[:, None]
-    return np.where((n_l > 0)[:, None], value * n_l[:, None], 0.0)
-
-
-gauss_legendre = cache(np.polynomial.legendre.leggauss)
-
-
-def albedo(name: str, wo: np.ndarray) -> np.ndarray:
-    """Directional albedo, float64 [3]: the integral of `gltf` over the hemisphere, in half vectors drawn by GGX."""
-    nodes, weights = gauss_legendre(256)
-    s, phi = (nodes + 1) / 2, 2 * np.pi * (np.arange(256) + 0.5) / 256
-    alpha2 = max(MATERIALS[name][2] ** 2, 1e-3) ** 2
-    z = np.sqrt((1 - s) / (1 + (alpha2 - 1) * s))[:, None] * np.ones_like(phi)
-    ring = np.sqrt(1 - z * z)
-    half = np.stack([ring * np.cos(phi), ring * np.sin(phi), z], axis=-1).reshape(-1, 3)
-    v_h = half @ wo
-    wi = 2 * v_h[:, None] * half - wo
-    d = alpha2 / (np.pi * (half[:, 2] ** 2 * (alpha2 - 1) + 1) ** 2)
-    jacobian = np.where(v_h > 1e-9, 4 * v_h / (d * half[:, 2]), 0.0)
-    measure = (weights[:, None] / 2 * np.ones_like(phi) / len(phi)).ravel()
-    return (gltf(name, wo, np.where(v_h[:, None] > 1e-9, wi, [0, 0, -1.0])) * (jacobian * measure)[:, None]).sum(0)
 
 
 @pytest.mark.parametrize("name", MATERIALS)
