@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 import warp_gi as gi
-from warp_gi.bench.harness import presets
+from warp_gi.bench.harness import scenes
 from warp_gi.bench.harness.measure import Taken, Times, take_turns, timed
 from warp_gi.bench.harness.places import PLACES
 from warp_gi.pipeline import TERMS
@@ -18,7 +18,7 @@ from warp_gi.pipeline import TERMS
 LAMBERT: Mapping[str, bool] = {"diffuse": True}
 DARK: Mapping[str, bool] = {"diffuse": True, "emission": False}
 PLAIN: Mapping[str, bool] = {"diffuse": False}
-"""Settings of `presets.peer_scene`."""
+"""Settings of `scenes.peer_scene`."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Case:
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Of its estimator, where not the defaults."""
     materials: Mapping[str, bool] | None = None
-    """What `presets.peer_scene` makes of them; None leaves them as they are."""
+    """What `scenes.peer_scene` makes of them; None leaves them as they are."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", self.name or PLACES[self.place].title)
@@ -47,7 +47,7 @@ class Case:
     def scene(self) -> gi.Scene:
         """Return the scene with its materials as they are measured."""
         scene = PLACES[self.place].scene()
-        return scene if self.materials is None else presets.peer_scene(scene, **self.materials)
+        return scene if self.materials is None else scenes.peer_scene(scene, **self.materials)
 
     def path(self) -> gi.CameraPath:
         """Return the place's camera path."""

@@ -11,7 +11,7 @@ from PIL import Image
 import warp_gi as gi
 from warp_gi.bench import mitsuba_reference, previews
 from warp_gi.bench.compare import reference as compare_reference
-from warp_gi.bench.harness import places, presets
+from warp_gi.bench.harness import places, scenes
 from warp_gi.bench.harness.places import PLACES, Place
 from warp_gi.bench.harness.stages import Case
 from warp_gi.bench.peers import blender_peer
@@ -101,7 +101,7 @@ def test_what_lights_a_place_is_its_own_or_the_tables():
 
 
 def test_files_are_read_and_what_is_missing_is_said(monkeypatch, tmp_path):
-    monkeypatch.setattr(presets, "SCENES", tmp_path)
+    monkeypatch.setattr(scenes, "SCENES", tmp_path)
     for name, place in PLACES.items():
         assert bool(place.missing) == (name not in BUILT)
         assert not place.missing or "WARP_GI_SCENES" in place.missing
@@ -114,7 +114,7 @@ def test_files_are_read_and_what_is_missing_is_said(monkeypatch, tmp_path):
     write_exr(tmp_path / "sky.exr", {"beauty": np.full((4, 8, 3), 2.0)}, {})
     assert place.missing == "" and place.scene().triangle_count == 1
     np.testing.assert_allclose(place.scene().environment.mean_radiance, 2.0, rtol=1e-3)
-    assert PLACES["dragon"].files == (presets.DRAGON,) and "environments" in PLACES["sponza_courtyard"].missing
+    assert PLACES["dragon"].files == (scenes.DRAGON,) and "environments" in PLACES["sponza_courtyard"].missing
 
 
 # ---- suites ----
@@ -159,7 +159,7 @@ def test_a_case_changes_materials_and_nothing_else():
 
 
 def test_suites_have_something_to_do_without_files(monkeypatch, tmp_path):
-    monkeypatch.setattr(presets, "SCENES", tmp_path)
+    monkeypatch.setattr(scenes, "SCENES", tmp_path)
     lists = [dvf_views.CASES, reuse_quality.QUICK_CASES, probes_denoise.CASES, probes_defaults.QUICK_CASES, path.CASES]
     for cases in (*lists, [PLACES[rays.CASES[name]] for name in rays.QUICK_SCENES]):
         assert any(not case.missing for case in cases)
@@ -169,7 +169,7 @@ def test_suites_have_something_to_do_without_files(monkeypatch, tmp_path):
 
 
 def test_previews_are_pngs_and_missing_places_are_passed_over(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(presets, "SCENES", tmp_path)
+    monkeypatch.setattr(scenes, "SCENES", tmp_path)
     monkeypatch.setattr(previews, "WIDTH", 24)
     folder = tmp_path / "seen"
     assert previews.main(["cornell_box", "sponza", "strobe", "-o", str(folder), "--spp", "4"]) == 0

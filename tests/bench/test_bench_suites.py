@@ -9,7 +9,7 @@ import pytest
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.bench.harness import diff, measure, presets, records, runner
+from warp_gi.bench.harness import diff, measure, records, runner, scenes
 from warp_gi.bench.harness import gallery as galleries
 from warp_gi.bench.harness.gallery import CLOSED, Gallery, PictureSet
 from warp_gi.bench.peers import blender_peer
@@ -127,7 +127,7 @@ def test_blender_is_a_row_where_it_is_missing(monkeypatch):
 
 
 def test_the_exported_file_holds_the_scene(tmp_path):
-    scene = presets.peer_scene(gi.builtin_scene("cornell_box"), diffuse=True)
+    scene = scenes.peer_scene(gi.builtin_scene("cornell_box"), diffuse=True)
     blender_peer.write_glb(scene, tmp_path / "s.glb")
     loaded = gi.load_scene(tmp_path / "s.glb")
     assert (loaded.triangle_count, loaded.emitter_count) == (scene.triangle_count, scene.emitter_count)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import warp_gi as gi
-from warp_gi.bench.harness import presets, runner
+from warp_gi.bench.harness import runner, scenes
 from warp_gi.bench.harness.places import PLACES
 from warp_gi.bench.suites import rays
 
@@ -51,7 +51,7 @@ def test_rays_start_on_the_surface_and_are_unit():
 
 
 def test_missing_scenes_give_a_row_and_unknown_ones_an_error(monkeypatch, tmp_path):
-    monkeypatch.setattr(presets, "SCENES", tmp_path)
+    monkeypatch.setattr(scenes, "SCENES", tmp_path)
     monkeypatch.setattr(rays, "QUICK_RAYS", 1000)
     monkeypatch.setitem(rays.CASES, "box", "cornell_box")
     monkeypatch.setattr(rays, "QUICK_SCENES", ("living room", "sponza", "box"))

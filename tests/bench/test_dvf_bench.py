@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import warp_gi as gi
-from warp_gi.bench.harness import presets, stages
+from warp_gi.bench.harness import scenes, stages
 from warp_gi.bench.harness.gallery import Gallery
 from warp_gi.bench.suites.dvf import peers as dvf_peers
 from warp_gi.bench.suites.dvf import suite as dvf
@@ -18,7 +18,7 @@ SIZE = (24, 16)
 
 @pytest.fixture(scope="module")
 def view() -> dvf_views.View:
-    scene = presets.peer_scene(gi.builtin_scene("cornell_box"), diffuse=True, emission=False)
+    scene = scenes.peer_scene(gi.builtin_scene("cornell_box"), diffuse=True, emission=False)
     scene.environment = (1.0, 1.0, 1.0)
     camera = gi.Camera.look_at((0, 1, 3.4), (0, 1, 0), hfov=55.0, resolution=SIZE)
     return dvf_views.View(scene, camera, cell_size=0.5, samples=3000, rays=64, resolution=18)
@@ -87,7 +87,7 @@ def test_the_flight_begins_and_ends_in_the_nave():
 
 
 def test_missing_scenes_give_rows_that_say_so(monkeypatch, tmp_path):
-    monkeypatch.setattr(presets, "SCENES", tmp_path)
+    monkeypatch.setattr(scenes, "SCENES", tmp_path)
     missing = tuple(case for case in dvf.CASES if case.missing)
     assert [case.name for case in missing] == ["Sponza", "Bistro"]
     monkeypatch.setattr(dvf_peers, "CASES", missing)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import warp_gi as gi
-from warp_gi.bench.harness import presets, stages
+from warp_gi.bench.harness import scenes, stages
 from warp_gi.bench.harness.gallery import Gallery
 from warp_gi.bench.harness.places import PLACES
 from warp_gi.bench.publish.figures import Grid
@@ -134,7 +134,7 @@ def furnace():
         ((-1, -1, 1), (0, 0, -2), (0, 2, 0)),
         ((1, -1, -1), (0, 0, 2), (0, 2, 0)),
     )
-    return gi.Scene([gi.Node("cube", [presets.quad(*corner, wall, f"wall {i}") for i, corner in enumerate(corners)])])
+    return gi.Scene([gi.Node("cube", [scenes.quad(*corner, wall, f"wall {i}") for i, corner in enumerate(corners)])])
 
 
 def test_irradiance_is_that_of_a_furnace():
@@ -247,7 +247,7 @@ def test_bakes_tell_time_memory_and_passes(view):
 def test_denoisers_are_compared_with_their_own_pipeline(monkeypatch):
     monkeypatch.setattr(probes_denoise, "FRAME", 2)
     monkeypatch.setattr(probes_denoise, "RAYS", (1,))
-    scene = presets.peer_scene(gi.builtin_scene("cornell_box"), diffuse=True)
+    scene = scenes.peer_scene(gi.builtin_scene("cornell_box"), diffuse=True)
     path = gi.builtin_camera_path("cornell_box").at_resolution(32, 24)
     gallery = Gallery()
     *skipped, row = probes_denoise.pipeline_rows("box", scene, path, "paths", {}, 32, "cpu", gallery)
@@ -261,7 +261,7 @@ def test_denoisers_are_compared_with_their_own_pipeline(monkeypatch):
 
 
 def test_missing_scenes_give_rows_that_say_so(monkeypatch, tmp_path):
-    monkeypatch.setattr(presets, "SCENES", tmp_path)
+    monkeypatch.setattr(scenes, "SCENES", tmp_path)
     for place in (probes_views.LIVING_ROOM, probes_views.SPONZA):
         assert "WARP_GI_SCENES" in place.missing
     monkeypatch.setattr(probes_defaults, "QUICK_CASES", (probes_defaults.CASES[0],))

@@ -12,7 +12,7 @@ from statistics_tools import every_device  # noqa: F401
 from test_truth_bsdf import MATERIALS, albedo, unit
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import light, quad, sphere
+from warp_gi.bench.harness.scenes import light, quad, sphere
 
 WHITE_MAP = np.ones((8, 16, 3), dtype=np.float32)
 SKIES = {"constant": (1.0, 1.0, 1.0), "map": gi.Environment(pixels=WHITE_MAP)}

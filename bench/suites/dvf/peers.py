@@ -14,7 +14,7 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.bench.harness import places, presets, scatter
+from warp_gi.bench.harness import places, scatter, scenes
 from warp_gi.bench.harness.measure import Row, Taken, in_process, peak_memory, take_turns
 from warp_gi.bench.harness.stages import LAMBERT, Case, timed_bake
 from warp_gi.bench.peers import mitsuba_peer
@@ -56,7 +56,7 @@ def smooth_sky(height: int = 64) -> gi.Environment:
 
 def sharp_sky() -> gi.Environment:
     """Return the courtyard, scaled to mean radiance 1."""
-    sky = gi.Environment.load(presets.SCENES / places.COURTYARD)
+    sky = gi.Environment.load(scenes.SCENES / places.COURTYARD)
     return replace(sky, scale=1.0 / float(sky.mean_radiance.mean()))
 
 
@@ -70,7 +70,7 @@ def equal_error_rows(quick: bool, device: str) -> list[Row]:
             if why := place.missing or (places.missing([places.COURTYARD]) if name == "courtyard" else ""):
                 rows.append({"table": "equal error", "case": place.name, "sky": name, "skipped": why})
                 continue
-            scene = presets.peer_scene(place.scene(), diffuse=True, masks=False, emission=False)
+            scene = scenes.peer_scene(place.scene(), diffuse=True, masks=False, emission=False)
             scene = gi.Scene(scene.nodes, [], sky(), scene.cameras, scene.name)
             rows += equal_error(place, scene, name, place.camera().at_resolution(*size), device, repetitions)
     return rows

@@ -11,7 +11,7 @@ import numpy as np
 import warp_gi as gi
 from warp_gi.bench.harness.measure import Row, Times
 from warp_gi.bench.harness.places import PLACES
-from warp_gi.bench.harness.presets import REFERENCE_DEPTH
+from warp_gi.bench.harness.scenes import REFERENCE_DEPTH
 from warp_gi.bench.harness.stages import LAMBERT, PLAIN, Case, Stage, timed_bake
 from warp_gi.metrics import RELATIVE_EPSILON
 

@@ -9,7 +9,7 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi.bench.harness.measure import Row, Times, cost, timed
-from warp_gi.bench.harness.presets import REFERENCE_DEPTH
+from warp_gi.bench.harness.scenes import REFERENCE_DEPTH
 from warp_gi.bench.harness.stages import Case
 
 MEASURED = ("emitters", "indirect", "beauty")
