@@ -216,6 +216,15 @@ def peak_memory() -> float:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0)
 
 
+def resident_memory() -> float:
+    """Return the bytes of memory that this process has resident; the most it has had where that is not known."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        return float(pages * os.sysconf("SC_PAGE_SIZE"))
+    except OSError:
+        return peak_memory()
+
+
 def _forget_peak() -> bool:
     """Set the high-water mark to what is resident now; False where that cannot be done."""
     try:

@@ -86,6 +86,26 @@ class Stage:
         wp.synchronize_device(self.frame.device)
 
 
+@dataclass
+class View:
+    """A scene from a camera on a device; bakes are made once for all settings that give the same one."""
+
+    scene: gi.Scene
+    camera: gi.Camera
+    device: str = "cpu"
+    path: gi.CameraPath | None = None
+    """What bakes are for, if more than the camera."""
+    bakes: dict[str, tuple[gi.Bake, Times]] = field(default_factory=dict)
+    """By the settings that they depend on."""
+
+    def bake(self, estimator: Any) -> tuple[gi.Bake, Times]:
+        """Return the bake and what it took, compilation apart."""
+        key = repr(estimator.bake_settings(self.scene))
+        if key not in self.bakes:
+            self.bakes[key] = timed_bake(self.scene, estimator, self.device, self.path or self.camera)
+        return self.bakes[key]
+
+
 def timed_bake(scene: gi.Scene, estimator: Any, device: str, camera: Any = None) -> tuple[gi.Bake, Times]:
     """Return what the camera, or path, makes the estimator bake, and seconds without compilation."""
     return timed(lambda: gi.bake(scene, estimator, device, camera_path=camera))

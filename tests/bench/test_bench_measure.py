@@ -13,7 +13,7 @@ from warp_gi import launch, metrics
 from warp_gi.bench.harness import gallery, measure, scatter, scenes
 from warp_gi.bench.harness.places import PLACES
 from warp_gi.bench.peers import mitsuba_peer
-from warp_gi.bench.suites import path
+from warp_gi.bench.suites.path import suite as path
 
 # ---- time ----
 

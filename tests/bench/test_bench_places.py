@@ -15,12 +15,13 @@ from warp_gi.bench.harness import places, scenes
 from warp_gi.bench.harness.places import PLACES, Place
 from warp_gi.bench.harness.stages import Case
 from warp_gi.bench.peers import blender_peer
-from warp_gi.bench.suites import path, rays
 from warp_gi.bench.suites.dvf import peers as dvf_peers
 from warp_gi.bench.suites.dvf import views as dvf_views
+from warp_gi.bench.suites.path import suite as path
 from warp_gi.bench.suites.probes import defaults as probes_defaults
 from warp_gi.bench.suites.probes import denoise as probes_denoise
 from warp_gi.bench.suites.probes import views as probes_views
+from warp_gi.bench.suites.rays import suite as rays
 from warp_gi.bench.suites.reuse import quality as reuse_quality
 from warp_gi.bench.suites.reuse import views as reuse_views
 from warp_gi.sequence.exr import write_exr
@@ -51,7 +52,7 @@ def test_references_lose_no_bounces_whatever_the_default_depth_is(monkeypatch):
     assert gi.BsdfPaths().max_depth == 8
     compared = compare_reference.computed(scene, camera, "cpu", 1, 256, centred=True)
     assert mean(compared.picture) == pytest.approx(mean(expected.numpy("beauty")), rel=0.015)
-    probes = probes_views.View(scene, camera, reference_spp=128)
+    probes = probes_views.ProbeView(scene, camera, reference_spp=128)
     assert mean(probes.reference) == pytest.approx(mean(expected.numpy("indirect")), rel=0.03)
     reuse = reuse_views.Truth(scene, camera, spp=128)
     assert mean(reuse.mean("indirect")) == pytest.approx(mean(expected.numpy("indirect")), rel=0.03)

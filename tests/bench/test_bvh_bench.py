@@ -8,7 +8,7 @@ import pytest
 import warp_gi as gi
 from warp_gi.bench.harness import runner, scenes
 from warp_gi.bench.harness.places import PLACES
-from warp_gi.bench.suites import rays
+from warp_gi.bench.suites.rays import suite as rays
 
 
 def test_rows_hold_every_contender_and_all_agree():

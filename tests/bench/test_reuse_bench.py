@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 import warp_gi as gi
-from warp_gi.bench.harness import runner, scenes
+from warp_gi.bench.harness import catalogue, scenes
 from warp_gi.bench.harness.gallery import Gallery
 from warp_gi.bench.suites.reuse import cost as reuse_cost
 from warp_gi.bench.suites.reuse import quality as reuse_quality
@@ -256,5 +256,5 @@ def test_missing_scenes_give_rows_that_say_so(monkeypatch, tmp_path):
 
 
 def test_the_suite_is_found_and_has_all_parts():
-    assert runner.suites()["reuse"].startswith("Sample reuse")
+    assert catalogue.suites()["reuse"].startswith("Sample reuse")
     assert set(reuse.PARTS) == {"quality", "adaptation", "turning", "cost", "strobe"}

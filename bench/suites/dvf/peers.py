@@ -18,8 +18,9 @@ from warp_gi.bench.harness import places, scatter, scenes
 from warp_gi.bench.harness.measure import Row, Taken, in_process, peak_memory, take_turns
 from warp_gi.bench.harness.stages import LAMBERT, Case, timed_bake
 from warp_gi.bench.peers import mitsuba_peer
-from warp_gi.bench.suites import path, rays
 from warp_gi.bench.suites.dvf.views import CASES, QUICK_CASES, QUICK_SETTINGS, QUICK_SIZE, SIZE
+from warp_gi.bench.suites.path import suite as path
+from warp_gi.bench.suites.rays import suite as rays
 from warp_gi.bvh import TriangleBvh
 from warp_gi.scene import harmonics
 

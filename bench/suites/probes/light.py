@@ -16,7 +16,7 @@ from warp_gi.bench.suites.probes.views import (
     LIVING_ROOM,
     ROOM,
     SPONZA,
-    View,
+    ProbeView,
     counts_of,
     room_views,
     view_of,
@@ -71,7 +71,7 @@ def leak_rows(quick: bool, device: str) -> list[Row]:
     return rows
 
 
-def _leak_row(views: dict[str, View], settings: dict[str, Any]) -> Row:
+def _leak_row(views: dict[str, ProbeView], settings: dict[str, Any]) -> Row:
     means = {name: view.stage(1, mode="irradiance", **settings) for name, view in views.items()}
     lit, dark = (float(means[name].picture.mean(dtype=np.float64)) for name in ("lit", "dark"))
     paths = float(views["lit"].reference.mean(dtype=np.float64))
@@ -85,7 +85,7 @@ def covered(stage: Stage) -> int:
     return int((stage.state.field.states.numpy() != 0).sum())
 
 
-def darkened(view: View, stage: Stage) -> Row:
+def darkened(view: ProbeView, stage: Stage) -> Row:
     """Return the share of what is seen whose indirect light is less than half, and more than twice, what it should be.
 
     In blocks of 8 x 8 pixels, in which the path tracer's noise is small.
@@ -137,7 +137,7 @@ def _grids(*counts: tuple[int, int, int]) -> list[dict[str, Any]]:
 
 
 def mode_rows(
-    place: Case, view: View, grids: list[dict[str, Any]], repetitions: int, gallery: Gallery = CLOSED
+    place: Case, view: ProbeView, grids: list[dict[str, Any]], repetitions: int, gallery: Gallery = CLOSED
 ) -> list[Row]:
     """Return rows of one place: of each mode and grid, beside the path tracer at equal time and equal error.
 
@@ -190,7 +190,7 @@ def bake_rows(quick: bool, device: str) -> list[Row]:
     return [*rows, {"table": f"bakes: paper, {PAPER_CARD}", "all its scenes": PAPER_BAKE}]
 
 
-def bake_row(place: Case, view: View, resolution: int) -> Row:
+def bake_row(place: Case, view: ProbeView, resolution: int) -> Row:
     """Return the row of one bake with 4 x 4 x 4 probes."""
     settings = gi.LightFieldProbes(counts=(4, 4, 4), resolution=resolution)
     bake, (wall, cpu) = view.bake(settings)

@@ -11,8 +11,9 @@ import warp_gi as gi
 from warp_gi.bench.harness.measure import Row, Times, cost, timed
 from warp_gi.bench.harness.scenes import REFERENCE_DEPTH
 from warp_gi.bench.harness.stages import Case
+from warp_gi.bench.suites.reuse.columns import TERMS
 
-MEASURED = ("emitters", "indirect", "beauty")
+MEASURED = TERMS
 SEED = 11
 TOLERANCE = 1.2
 """Times the settled error: within it, a sequence has settled."""

@@ -11,11 +11,18 @@ from typing import Any
 import numpy as np
 
 from warp_gi import launch
-from warp_gi.bench.harness.measure import PeakMemory, Row, Taken, median_and_spread, ratio_and_spread, take_turns
-from warp_gi.bench.suites.rays import NO_EMBREE, diffuse_rays, embree_builder, primary_rays, trace
+from warp_gi.bench.harness.measure import (
+    PeakMemory,
+    Row,
+    Taken,
+    median_and_spread,
+    ratio_and_spread,
+    resident_memory,
+    take_turns,
+)
+from warp_gi.bench.suites.rays.suite import NO_EMBREE, diffuse_rays, embree_builder, primary_rays, trace
 from warp_gi.bench.suites.scaling.fits import Growth
 from warp_gi.bench.suites.scaling.mesh import CROWD_VIEW, crowd
-from warp_gi.bench.suites.sequence import resident_memory
 from warp_gi.bvh import TriangleBvh
 
 COUNTS = (10_000, 31_600, 100_000, 316_000, 1_000_000, 3_160_000, 10_000_000)
