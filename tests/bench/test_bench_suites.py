@@ -42,6 +42,7 @@ def test_the_suite_counts_what_the_first_frame_needs(monkeypatch):
     quick, full = compile.run(quick=True), compile.run(quick=False)
     assert [row.get("module") for row in quick] == ["compose", "gbuffer", None]
     assert len(full) > 20 and [row["module"] for row in full if "failed" in row] == ["bvh_build"]
+    assert catalogue.columns_of("compile").undeclared(full) == []
     for rows in (quick, full):
         last = rows[-1]
         assert last["table"] == "first frame" and last["modules"] == last["measured"] == 2
@@ -59,6 +60,7 @@ SMALL = sequence.Size(6, "24x16", 2)
 def test_a_sequence_is_rendered_and_measured():
     found = sequence.measure("cornell_box", ("--denoise", "spatiotemporal"), SMALL, "cpu")
     rows = sequence.rows_of("path", found, SMALL)
+    assert catalogue.columns_of("sequence").undeclared(rows) == []
     speed, stages, memory, *series = rows
     assert (
         speed["frames a minute"] == pytest.approx(360 / (speed["wall s"] - stages["compile s"]))

@@ -9,6 +9,7 @@ import warp_gi as gi
 from warp_gi.bench.harness import runner, scenes
 from warp_gi.bench.harness.places import PLACES
 from warp_gi.bench.suites.rays import suite as rays
+from warp_gi.bench.suites.rays.columns import COLUMNS
 
 
 def test_rows_hold_every_contender_and_all_agree():
@@ -20,6 +21,7 @@ def test_rows_hold_every_contender_and_all_agree():
         "primary": rays.primary_rays(gi.CameraKey(0.0, (0.5, 0.5, 3.0), (0.5, 0.5, 0.5), hfov=40.0), 6000),
     }
     build, *races = rays.compare("soup", points, indices, batches, repetitions=1)
+    assert COLUMNS.undeclared([build, *races]) == []
     has_peer = "skipped" not in races[0]
     races = races if has_peer else races[1:]
     assert build["triangles"] == 300 and build["ours build s"] > 0.0 and build["bytes a triangle"] > 0.0

@@ -11,6 +11,7 @@ from warp_gi.bench.harness.gallery import Gallery
 from warp_gi.bench.suites.dvf import peers as dvf_peers
 from warp_gi.bench.suites.dvf import suite as dvf
 from warp_gi.bench.suites.dvf import views as dvf_views
+from warp_gi.bench.suites.dvf.columns import COLUMNS
 from warp_gi.techniques.visibility_field import audit as visibility_audit
 
 SIZE = (24, 16)
@@ -32,6 +33,7 @@ def test_mode_rows_hold_ratios_and_errors(view, monkeypatch):
     rows = dvf.mode_rows("box", view, 1, 4.0, gallery=gallery)
     assert [row["mode"] for row in rows] == [*dvf.MODES, "paper, its settings"]
     assert len({tuple(row) for row in rows}) == 1  # one table
+    assert COLUMNS.undeclared(rows) == []
     for row in rows:
         assert row["ratio wall"] > 0.0 and row["ratio cpu"] > 0.0 and row["target"] == 4.0
         assert 0.0 <= row["RMSE"] < 0.2 and 0.0 < row["traced share"] < 1.0 and row["wrong per million"] >= 0.0
@@ -60,6 +62,7 @@ def test_settings_sample_counts_and_coats_each_make_a_table(view, monkeypatch):
     ours = [row for row in swept if "paper" not in row["table"]]
     assert all(row["MB"] <= row["MB of all cells"] and row["bake samples"] > 0 for row in ours)
     rows = dvf.sample_count_rows("Sponza", view, 1, quick=True) + dvf.glossy_rows("Sponza", view, 1)
+    assert COLUMNS.undeclared(swept + rows) == []
     papers = {row["table"] for row in rows if "RTX 3080" in row["table"]}
     assert len(papers) == 2 and not any("RMSE" in row for row in rows if row["table"] in papers)
 
@@ -77,6 +80,7 @@ def test_equal_error_bake_rate_and_relighting(view, monkeypatch):
     rate = dvf_peers.bake_rate("box", scene, view.camera, "cpu", 2000, view.estimator())
     assert rate["rays asked"] >= rate["rays traced"] > 0 and rate["bake / raw, cpu"] > 0.0
     relit = dvf_peers.relight("box", scene, view.camera, frames=3, cell_size=0.5)
+    assert COLUMNS.undeclared([*rows, rate, *relit]) == []
     assert [row["relight"] for row in relit] == [True, False] and all(row["later wall s"] > 0.0 for row in relit)
 
 

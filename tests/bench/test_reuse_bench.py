@@ -14,6 +14,7 @@ from warp_gi.bench.suites.reuse import quality as reuse_quality
 from warp_gi.bench.suites.reuse import suite as reuse
 from warp_gi.bench.suites.reuse import time as reuse_time
 from warp_gi.bench.suites.reuse import views as reuse_views
+from warp_gi.bench.suites.reuse.columns import COLUMNS
 from warp_gi.scene.animation import keyframe_matrix
 
 SIZE = (24, 16)
@@ -146,6 +147,7 @@ def test_combinations_stand_beside_the_baseline(box):
     gallery = Gallery()
     rows = reuse_quality.place_rows(place, SIZE, 32, 4, 2, "cpu", gallery)
     errors, times = rows[:6], rows[6:]
+    assert COLUMNS.undeclared(rows) == []
     assert len(times) == 6 and len({tuple(row) for row in errors}) == len({tuple(row) for row in times}) == 1
     base = errors[0]
     assert base["combination"] == reuse_quality.BASELINE
@@ -173,6 +175,7 @@ def test_targets_name_the_worst():
                 row |= {f"{term} / baseline": 1.0 + k + 0.1 * j, f"{term}, equal time": 2.0}
             rows.append(row)
     targets = reuse_quality.target_rows([*rows, {"case": "dragon", "skipped": "no file"}])
+    assert COLUMNS.undeclared(targets) == []
     assert targets[0]["target"] == 1 / 8 and targets[0]["equal samples"] == 3.0
     worst = targets[1]
     assert worst["combination"] == "worst: VisibilityLightCache + GuidedPaths" and worst["equal samples"] == 3.1
@@ -188,7 +191,7 @@ def test_paths_take_a_places_settings():
 
 def test_adaptation_starts_from_nothing():
     rows = reuse_time.place_adaptation(reuse_views.CORNELL, SIZE, 32, 1, 5, "cpu")
-    assert [row["term"] for row in rows] == ["emitters", "indirect"]
+    assert [row["term"] for row in rows] == ["emitters", "indirect"] and COLUMNS.undeclared(rows) == []
     for row in rows:
         assert len(row["MSE / settled by frame"].split()) == 6 and row["settled MSE"] > 0 and row["target"] == 8
 
@@ -196,7 +199,7 @@ def test_adaptation_starts_from_nothing():
 def test_turns_cover_bits_and_migrations():
     rows = reuse_time.turn_rows(36.0, (32, 128), (12, 12), 64, 1, (4, 6), "cpu")
     assert [(row["bits"], row["migrations"]) for row in rows] == [(32, 1), (32, 8), (128, 1), (128, 8)]
-    assert [row["target"] for row in rows] == ["", "", 20, 8]
+    assert [row["target"] for row in rows] == ["", "", 20, 8] and COLUMNS.undeclared(rows) == []
     for row in rows:
         assert len(row["MSE / settled by frame"].split()) == 6 and row["peak / settled"] >= 1
         assert row["frames until settled"] <= 6
@@ -206,6 +209,7 @@ def test_strobes_are_rows_by_what_the_lamp_does():
     base = np.ones(32)
     ours = np.where(np.arange(32) % 16 < 4, 4.0, 0.5)
     out, into = reuse_time.strobe_kind_rows("jump", "ours", {"ours": ours, "baseline": base})
+    assert COLUMNS.undeclared([out, into]) == []
     assert (out["case"], into["case"]) == ("lamp out of the box", "lamp into the box")
     for row in (out, into):
         assert row["settled MSE"] == 0.5 and row["peak / settled"] == 8 and row["frames until settled"] == 4
@@ -226,6 +230,7 @@ def test_strobe_series_leave_out_the_first_period(monkeypatch):
 
 def test_costs_list_passes_and_memory(box):
     rows = reuse_cost.place_cost(reuse_views.CORNELL, SIZE, 3, 1, "cpu")
+    assert COLUMNS.undeclared(rows) == []
     passes = {row["pass"]: row for row in rows if row["table"] == "passes"}
     assert {"learn octree", "learn emitters", "learn indirect", "preprocess emitters", "all"} <= set(passes)
     others = sum(row["ms"] for name, row in passes.items() if name != "all")

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 import warp_gi as gi
-from warp_gi import launch
 from warp_gi.bench.harness import places, scatter, scenes
 from warp_gi.bench.harness.measure import Row, Taken, in_process, peak_memory, take_turns
 from warp_gi.bench.harness.stages import LAMBERT, Case, timed_bake
@@ -176,7 +175,7 @@ def bake_rate(
     timed_bake(scene, replace(field, samples=1), device, camera.at_resolution(16, 9))  # compiles
     bake, (wall, cpu) = timed_bake(scene, field, device, camera)
     traced = bake.counts["rays_traced"]
-    row: Row = {"table": "bake rate", "case": name, "threads": launch.thread_count(), "cells": bake.counts["cells"]}
+    row: Row = {"table": "bake rate", "case": name, "cells": bake.counts["cells"]}
     row |= {"rays asked": bake.counts["rays"], "rays traced": traced, "wall s": wall, "cpu s": cpu}
     row |= {"Mrays/wall s": traced / wall / 1e6, "raw Mrays/wall s": count / raw_wall / 1e6}
     row |= {"Mrays/cpu s": traced / max(cpu, 1e-9) / 1e6, "raw Mrays/cpu s": count / raw_cpu / 1e6}
