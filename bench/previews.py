@@ -44,7 +44,7 @@ README_PICTURES = {
     "assets/atrium.jpg": ReadmePicture(("atrium",), (960, 540), 64, frame=20),
     "assets/places.jpg": ReadmePicture(("street", "warehouse", "two_rooms", "sphere_row"), (240, 135), 256, columns=4),
 }
-"""By file."""
+"""Pictures by file."""
 
 
 def render(name: str, size: tuple[int, int], spp: int, frame: int = 0, device: str = "cpu") -> np.ndarray:

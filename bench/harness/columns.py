@@ -38,7 +38,7 @@ NOTE = Kind("note", None)
 TIME = Kind("time", 0.15, is_timed=True)
 RATE = Kind("rate", 0.15, is_timed=True)
 RATIO = Kind("ratio", 0.15, is_timed=True)
-"""Of times or rates, or how they grow."""
+"""Ratios of times or rates, and exponents of their growth."""
 ERROR = Kind("error", 0.05)
 """Errors, ratios of errors, and shares that are right or wrong."""
 COUNT = Kind("count", 0.05)

@@ -44,7 +44,7 @@ class Difference:
     worse: list[Change] = field(default_factory=list)
     better: list[Change] = field(default_factory=list)
     changed: list[Change] = field(default_factory=list)
-    """In columns of which neither lower nor higher is better."""
+    """Changes in columns of which neither lower nor higher is better."""
     only_old: list[tuple[Identity, str]] = field(default_factory=list)
     """Rows, and columns of rows in both; the column of a whole row is empty."""
     only_new: list[tuple[Identity, str]] = field(default_factory=list)

@@ -40,7 +40,7 @@ class Taken(Generic[T]):
     wall: list[float] = field(default_factory=list)
     cpu: list[float] = field(default_factory=list)
     device: list[float] = field(default_factory=list)
-    """By events on a CUDA device; empty on the CPU."""
+    """Seconds by events on a CUDA device; empty on the CPU."""
     results: list[T] = field(default_factory=list)
 
     @property

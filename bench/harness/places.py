@@ -137,4 +137,4 @@ PLACES: dict[str, Place] = {
     "sponza_gallery": Place("Sponza, gallery", _SPONZA, _GALLERY, WHITE),
     "sponza_gallery_courtyard": Place("Sponza, gallery, courtyard sky", _SPONZA, _GALLERY, COURTYARD),
 }
-"""By key. Suites name keys, and add what is theirs: targets, settings of estimators, depths, sizes."""
+"""Places by key. Suites name keys, and add what is theirs: targets, settings of estimators, depths, sizes."""

@@ -10,10 +10,10 @@ class Sequence:
     """A pipeline that renders the suite's sequence."""
 
     arguments: tuple[str, ...]
-    """Of ``warp-gi render``, scene, frames, size and samples apart."""
+    """Arguments of ``warp-gi render``; the suite adds scene, frames, size and samples."""
     is_quick: bool = True
     """Whether the quick form renders it too."""
     smaller: tuple[str, ...] = ()
     """Arguments that the quick form adds, as its frames are too few to pay for a bake."""
     smaller_title: str = ""
-    """What the quick form's rows say of them."""
+    """How the pipeline's name in rows of the quick form tells of ``smaller``."""

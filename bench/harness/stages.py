@@ -28,13 +28,13 @@ class Case:
     place: str
     """Key in `PLACES`."""
     name: str = ""
-    """In rows; the place's title if not given."""
+    """Name in rows; the place's title if not given."""
     target: float = 0.0
     """How many times faster than the baseline the estimator shall be."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Of its estimator, where not the defaults."""
+    """Settings of the estimator that are not its defaults."""
     materials: Mapping[str, bool] | None = None
-    """What `scenes.peer_scene` makes of them; None leaves them as they are."""
+    """Settings of `scenes.peer_scene` for the materials; None leaves them as they are."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", self.name or PLACES[self.place].title)
@@ -94,9 +94,9 @@ class View:
     camera: gi.Camera
     device: str = "cpu"
     path: gi.CameraPath | None = None
-    """What bakes are for, if more than the camera."""
+    """Camera path that bakes are made for; None for the camera alone."""
     bakes: dict[str, tuple[gi.Bake, Times]] = field(default_factory=dict)
-    """By the settings that they depend on."""
+    """Bakes and their seconds, by the settings that they depend on."""
 
     def bake(self, estimator: Any) -> tuple[gi.Bake, Times]:
         """Return the bake and what it took, compilation apart."""

@@ -25,7 +25,7 @@ from warp_gi.files import replacing
 PAGE, README, PAGES = Path("docs/results.md"), Path("README.md"), "docs/**/*.md"
 RESULTS = "bench/results"
 DEVICE = "cpu"
-"""Of the figures in regions; the tables of the page have those of all devices."""
+"""Device whose figures regions show; the tables of the page have all devices."""
 HEADLINES = "headlines"
 REGION = re.compile(r"(<!-- results: (?P<name>[^\n]*?) -->\n)(?P<text>.*?)(?P<end><!-- end -->|\Z)", re.DOTALL)
 

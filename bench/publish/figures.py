@@ -29,10 +29,10 @@ class Figure:
     """Significant ones, at least."""
     scale: float = 1.0
     at_least: float | str | None = None
-    """What a value below is bold: a number, or the column that holds it."""
+    """Least value that is not bold: a number, or the column that holds it."""
     at_most: float | str | None = None
     table: str | None = None
-    """Where not the table of the whole."""
+    """Table of the results, if it is not that of the paragraph or grid."""
     over: str = ""
     """A column that each row's value is divided by."""
 
@@ -58,9 +58,10 @@ class Grid:
     """A table of a region."""
 
     header: str
-    """Of the first column."""
+    """Header of the first column."""
     lines: Mapping[str, Only] | str
-    """The first column, and which rows of the results its line is of; or a column, each value of which has a line."""
+    """Cells of the first column, and the rows of the results that each line shows; or the name of a key column, each of
+    whose values makes a line."""
     columns: tuple[GridColumn, ...]
     table: str = ""
 
@@ -77,7 +78,7 @@ class Text:
     """A paragraph of a region."""
 
     words: str
-    """With names of figures in braces."""
+    """Text with names of figures in braces."""
     figures: Mapping[str, Figure]
     table: str = ""
 
@@ -95,9 +96,9 @@ class Region:
     """
 
     columns: Columns
-    """Of the suite."""
+    """The columns of its suite."""
     introduction: str
-    """What stands above it in the page of results."""
+    """Paragraph above it in the page of results."""
     parts: tuple[Grid | Text, ...]
 
     def __post_init__(self) -> None:

@@ -10,7 +10,7 @@ from warp_gi.bench.harness.tables import shown
 from warp_gi.bench.publish.figures import wrapped
 
 MOST_COLUMNS = 12
-"""Of a table; one with more is parted."""
+"""Columns of a table at most; one with more is parted."""
 HEAD = (
     "# Results",
     "Generated from `bench/results/*.jsonl` by `python -m warp_gi.bench.publish`; changes made here are lost.",

@@ -22,7 +22,7 @@ DARK_TABLE = "default settings: dark room of two"
 IRRADIANCE_TABLE = "default settings: irradiance at first hits"
 MODES = ("irradiance", "hybrid")
 SPP = 16
-"""That a pipeline has unless told otherwise; where too few probes see a point, the mode "irradiance" traces them."""
+"""Samples a pixel, a pipeline's default; the mode "irradiance" traces them only where too few probes see a point."""
 MOST_BAKE = 40.0
 """CPU seconds that a bake may take."""
 DARK_TARGETS = {"probes": 0.015, "exact": 0.006}

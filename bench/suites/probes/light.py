@@ -24,9 +24,9 @@ from warp_gi.bench.suites.probes.views import (
 from warp_gi.techniques.light_field.places import lit_data
 
 SPP = 4
-"""Of the modes that trace rays."""
+"""Samples a pixel of the modes that trace rays."""
 PATH_SPP = 16
-"""That the path tracer's time and noise a sample are measured with."""
+"""Samples a pixel with which the path tracer's time and noise a sample are measured."""
 QUICK_GRIDS = 1
 """Places whose light the quick form measures."""
 RESOLUTION = 128
@@ -47,7 +47,7 @@ PAPER_MS = (
     ("Luxury Kitchen", "4 x 4 x 4", 1024, 0.358, 9.334),
     ("San Miguel", "8 x 2 x 8", 1024, 0.520, 47.170),
 )
-"""Its table 1: milliseconds at 1920x1080 for the Lambertian and the glossy term."""
+"""The paper's table 1: milliseconds at 1920x1080 for the Lambertian and the glossy term."""
 PAPER_BAKE = "60 to 120 s"
 
 

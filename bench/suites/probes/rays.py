@@ -18,11 +18,11 @@ from warp_gi.kernels import light_field_march as march_kernels
 from warp_gi.techniques.light_field.ray import march_rays
 
 SHARE, METRES = 0.02, 0.05
-"""Of distance, and of space, within which hits agree; the larger one counts."""
+"""Hits agree within this share of their distance or this many metres, whichever is more."""
 CASE = (4, 4, 4), 256
 RESOLUTIONS = (64, 256, 1024)
 COUNTS = ((1, 4, 1), (4, 4, 4), (8, 4, 8))
-"""As in the paper's figures 18 and 19."""
+"""Probes along x, y and z, as in the paper's figures 18 and 19."""
 RAYS = 100_000
 
 

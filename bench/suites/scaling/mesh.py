@@ -12,7 +12,7 @@ from warp_gi.scene.camera import CameraKey
 SIDE, HEIGHT = 12.0, 5.0
 """Metres, of the room of the crowd."""
 BLOBS = 5
-"""Along each side of the room; there is none where the camera is."""
+"""Number of blobs along each side of the room; there is none where the camera is."""
 WALL_SHARE = 1 / 8
 """Of the triangles."""
 OCTAVES = ((2.0, 0.22), (4.0, 0.12), (7.0, 0.07))

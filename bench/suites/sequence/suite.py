@@ -28,7 +28,7 @@ SCENE = PLACES["atrium"].source
 CASES: dict[str, sequences.Sequence] = {
     name: case for _, module in catalogue.modules("sequence") for name, case in module.CASES.items()
 }
-"""What the suites' folders add, by the pipeline's name in rows."""
+"""Pipelines that suites' folders add, by their names in rows."""
 MOST_POINTS = 20
 STAGES = ("preprocess", "trace", "denoise", "write")
 _OTHERS = ("bake", "compile")
@@ -40,7 +40,7 @@ class Size:
 
     frames: int
     pixels: str
-    """As 240x135."""
+    """Width and height, such as 240x135."""
     spp: int
 
 
