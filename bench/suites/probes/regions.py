@@ -115,8 +115,8 @@ _PROBES = Region(
             "indirect light",
         ),
         Text(
-            "Of the rays through {probes} probes these end where the tree's do, in %, and so many million a second one "
-            "thread marches:",
+            "Share of rays through {probes} probes that end where the BVH's do (%), and million rays marched per second "
+            "on one thread:",
             {"probes": Figure("probes", {"probes": "4 x 4 x 4"})},
             "rays",
         ),

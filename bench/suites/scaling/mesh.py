@@ -10,11 +10,11 @@ from warp_gi.scene.builtin import shapes
 from warp_gi.scene.camera import CameraKey
 
 SIDE, HEIGHT = 12.0, 5.0
-"""Metres, of the room of the crowd."""
+"""Side and height of the crowd's room in metres."""
 BLOBS = 5
 """Number of blobs along each side of the room; there is none where the camera is."""
 WALL_SHARE = 1 / 8
-"""Of the triangles."""
+"""Share of the triangles that the walls have."""
 OCTAVES = ((2.0, 0.22), (4.0, 0.12), (7.0, 0.07))
 """Frequency and amplitude of a blob's waves; even the coarsest mesh has about two vertices for each."""
 CROWD_VIEW = CameraKey(0.0, (-5.2, 2.4, 5.2), (1.5, 1.2, -1.5), hfov=75.0)

@@ -29,9 +29,10 @@ _SCALING = Region(
             "triangles: growth",
         ),
         Text(
-            "Wanted were {target} times for ten times the triangles, and at most {most} bytes for each: it is {bytes}. "
-            "Exponents of the time to build {build} (Embree {embree}), of a frame over the number of lights {lights}, "
-            "over pixels {pixels}; of bakes over samples {samples}. {threads} threads render {faster} times as fast.",
+            "Targets: a ray takes at most {target} times as long with ten times the triangles, and the tree at most {most} "
+            "bytes a triangle; it takes {bytes}. Exponents of growth: of building over triangles {build} (Embree "
+            "{embree}), of a frame over lights {lights}, of a frame over pixels {pixels}, of bakes over samples "
+            "{samples}. {threads} threads render {faster} times as fast as one.",
             {
                 "target": Figure("target", {"renderer": "ours"}),
                 "most": Figure("target", table="triangles: memory", digits=3),

@@ -31,15 +31,15 @@ RAYS, QUICK_RAYS = 250_000, 30_000
 TURNS, QUICK_TURNS = 5, 3
 BUILDS = 3
 MOST_GROWTH, MOST_BYTES = 1.8, 120.0
-"""Time a ray for ten times the triangles, and bytes of the tree a triangle: what is aimed at."""
+"""Targets: how many times longer a ray may take with ten times the triangles, and the tree's bytes a triangle."""
 QUERIES = {"any": "OCCLUDED", "closest": "INTERSECT"}
-"""Ours and Embree's."""
+"""Queries by our name, and Embree's names of them."""
 CONTENDERS = ("ours", "embree")
 FEW, TIMES = 128, 4
 KINDS = ("primary", "diffuse", "diffuse, sorted", "diffuse, few")
-"""Of rays. Sorted ones start near those before them; "few" are FEW rays again and again, all of whose nodes stay in the
-cache: how their time grows is how the work grows, and what others grow beyond it is memory. They come TIMES in a row,
-which the tree takes as in order already."""
+"""Kinds of rays. Sorted ones start near those before them. "few" repeats FEW rays, so that all nodes stay in the cache:
+its time grows as the traversal work does; where the time of other kinds grows more, the rest is memory. Each of the few
+comes TIMES in a row, which the tree takes as in order already."""
 
 
 @dataclass
