@@ -115,8 +115,8 @@ _PROBES = Region(
             "indirect light",
         ),
         Text(
-            "Share of rays through {probes} probes that end where the BVH's do (%), and million rays marched per second "
-            "on one thread:",
+            "Share of rays through {probes} probes that end where the BVH's do (%), and million rays marched per "
+            "second on one thread:",
             {"probes": Figure("probes", {"probes": "4 x 4 x 4"})},
             "rays",
         ),
