@@ -31,8 +31,8 @@ _SCALING = Region(
         Text(
             "Targets: a ray takes at most {target} times as long with ten times the triangles, and the tree at most "
             "{most} bytes a triangle; it takes {bytes}. Exponents of growth: of building over triangles {build} "
-            "(Embree {embree}), of a frame over lights {lights}, of a frame over pixels {pixels}, of bakes over samples "
-            "{samples}. {threads} threads render {faster} times as fast as one.",
+            "(Embree {embree}), of a frame over lights {lights}, of a frame over pixels {pixels}, of bakes over "
+            "samples {samples}. {threads} threads render {faster} times as fast as one.",
             {
                 "target": Figure("target", {"renderer": "ours"}),
                 "most": Figure("target", table="triangles: memory", digits=3),
