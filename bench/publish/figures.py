@@ -120,10 +120,15 @@ class Headline:
 
     columns: Columns
     technique: str
-    page: str
-    """A file of ``docs/techniques``, without its suffix."""
-    paper: str
+    """Name of the class."""
+    purpose: str
+    """What it does, in a few words."""
     text: Text
+    title: str
+    """Title of its page."""
+    page: str
+    """File of ``docs/techniques``, without its suffix."""
+    paper: str = ""
     is_base: bool = False
     """Whether it is of what techniques stand on; such lines come last."""
 
@@ -142,9 +147,10 @@ def headlines_text(headlines: Sequence[Headline], rows: Sequence[records.Row]) -
     """Return the table of headlines as Markdown; raises OptionError where the results have no value for a figure."""
     lines = []
     for one in sorted(headlines, key=lambda one: one.is_base):
-        link = f"[{one.technique}](docs/techniques/{one.page}.md)"
-        lines.append([link, one.paper, _Source.of("headlines", one.columns.suite, rows).words(one.text)])
-    return markdown.table(["technique", "paper", "headline"], lines)
+        words = _Source.of("headlines", one.columns.suite, rows).words(one.text)
+        link = f"[{one.title}](docs/techniques/{one.page}.md)"
+        lines.append([f"`{one.technique}`", one.purpose, words, f"{link}, after {one.paper}" if one.paper else link])
+    return markdown.table(["technique", "what it does", "headline", "page"], lines)
 
 
 @dataclass(frozen=True)

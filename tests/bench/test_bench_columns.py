@@ -105,7 +105,7 @@ def test_rows_with_other_columns_fail_and_stay(monkeypatch, capsys, tmp_path):
         lambda: Region(SOME, "", (Grid("", {"a": {"wal s": 1}}, ()),)),
         lambda: Region(SOME, "", (Grid("", "wal s", ()),)),
         lambda: Region(SOME, "", (Grid("", "case", (GridColumn("", Figure("wall s"), {"wal s": 1}),)),)),
-        lambda: Headline(SOME, "x", "x", "x", Text("{x}", {"x": Figure("wall s", {"wal s": 1})})),
+        lambda: Headline(SOME, "x", "x", Text("{x}", {"x": Figure("wall s", {"wal s": 1})}), "x", "x"),
     ],
 )
 def test_a_name_that_is_not_declared_fails_where_it_is_used(make):
@@ -149,7 +149,7 @@ PLOTS = choices(COLUMNS, Choice("t", "Toys", "size", ("toy s",)))
     "regions": """from warp_gi.bench.publish.figures import Figure, Grid, GridColumn, Headline, Region, Text
 from warp_gi.bench.suites.toy.columns import COLUMNS
 REGIONS = {"toy": Region(COLUMNS, "**Toys**:", (Grid("size", "size", (GridColumn("s", Figure("toy s")),), "t"),))}
-HEADLINES = (Headline(COLUMNS, "Toys", "toys", "", Text("{s} s", {"s": Figure("toy s")}, "t")),)
+HEADLINES = (Headline(COLUMNS, "Toy", "plays", Text("{s} s", {"s": Figure("toy s")}, "t"), "toys", "toys"),)
 """,
     "sequence": """from warp_gi.bench.harness.sequences import Sequence
 CASES = {"toy": Sequence(("--pipeline", "toy"))}
@@ -194,7 +194,9 @@ def test_a_suite_is_its_folder(toy, capsys):
     assert [change.column for change in diff.compare(rows, slower).worse] == ["toy s"] * 2
     (toy / "README.md").write_text("<!-- results: headlines -->\n<!-- end -->\n", encoding="utf-8")
     assert publish.publish(toy) == [publish.PAGE, publish.README]
-    assert "| [Toys](docs/techniques/toys.md) |  | 1.0 to 2.0 s |" in (toy / "README.md").read_text(encoding="utf-8")
+    assert "| `Toy` | plays | 1.0 to 2.0 s | [toys](docs/techniques/toys.md) |" in (toy / "README.md").read_text(
+        encoding="utf-8"
+    )
     page = (toy / "docs/results.md").read_text(encoding="utf-8")
     assert "**Toys**:\n\n<!-- results: toy -->\n| size | s |\n|---|--:|\n| 1 | 1.0 |\n| 2 | 2.0 |\n" in page
     assert [suite for suite, _ in catalogue.modules("sequence")] == ["toy"]

@@ -46,7 +46,7 @@ SMALL = Region(
     ),
 )
 """Stands for the region "path"."""
-FIRST = Headline(COLUMNS, "Paths", "path_tracing", "", Text("first in {s} s", {"s": Figure("wall s")}))
+FIRST = Headline(COLUMNS, "Paths", "traces", Text("first in {s} s", {"s": Figure("wall s")}), "paths", "paths")
 SUITES = catalogue.suites()
 
 
@@ -247,11 +247,10 @@ def test_a_figure_may_be_a_ratio_of_columns_and_a_table_have_a_line_for_each_val
 
 def test_headlines_are_lines_of_a_table_and_those_of_the_base_come_last():
     words = Text("{x} of {case}", {"x": Figure("x"), "case": Figure("case")}, "t")
-    lines = [Headline(OF_S, name, "page", "A 2020", words, is_base=name == "base") for name in ("base", "technique")]
+    lines = [Headline(OF_S, name, "does", words, "Page", "page", "A 2020", name == "base") for name in ("base", "top")]
     table = headlines_text(lines, [{"suite": "s"} | row for row in AB[:1]]).splitlines()
-    assert table[2:] == [
-        f"| [{name}](docs/techniques/page.md) | A 2020 | 0.12 of a |" for name in ("technique", "base")
-    ]
+    link = "[Page](docs/techniques/page.md), after A 2020"
+    assert table[2:] == [f"| `{name}` | does | 0.12 of a | {link} |" for name in ("top", "base")]
 
 
 def test_a_column_can_have_nothing_to_show():

@@ -181,24 +181,28 @@ def _gain(case: str) -> Figure:
 HEADLINES = (
     Headline(
         COLUMNS,
-        "Light field probes",
-        "light_field_probes",
-        "McGuire et al. 2017",
+        "LightFieldProbes",
+        "reads indirect light from a baked grid of probes",
         Text(
-            "diffuse indirect light {faster} times as fast as by paths of the same error",
+            "{faster} times less CPU time for diffuse indirect light than paths of the same error",
             {"faster": Figure("faster, cpu", {"mode": "irradiance"})},
             "indirect light",
         ),
+        "light field probes",
+        "light_field_probes",
+        "McGuire et al. 2017",
     ),
     Headline(
         COLUMNS,
-        "Spatiotemporal denoiser",
-        "sample_reuse",
-        "Dittebrandt et al. 2020",
+        "SpatioTemporal",
+        "denoises over frames and neighbouring pixels",
         Text(
-            "RMSE at one ray a pixel {least} times lower in the atrium, {most} times in the Cornell box",
+            "one ray a pixel: RMSE {least} times lower in the atrium, {most} times in the Cornell box",
             {"least": _gain("atrium"), "most": _gain("cornell_box")},
             "denoise",
         ),
+        "denoising",
+        "denoising",
+        "Dittebrandt et al. 2020",
     ),
 )

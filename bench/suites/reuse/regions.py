@@ -6,6 +6,7 @@ from warp_gi.bench.publish.figures import Figure, Grid, GridColumn, Headline, On
 from warp_gi.bench.suites.reuse.columns import COLUMNS
 
 _LEARNT = "VisibilityLightCache + GuidedPaths"
+_POWER = Figure("emitters / baseline", {"case": "warehouse", "combination": "PowerLights + BsdfPaths"})
 _CACHE_ALONE, _GUIDES_ALONE = "VisibilityLightCache + BsdfPaths", "LightHierarchy + GuidedPaths"
 
 
@@ -76,7 +77,7 @@ _REUSE = Region(
             "the light by 36 degrees quadtrees of 128 bits settle in {fast} frames, with one migration a frame in "
             "{slow} (the paper: {paper_turn}). A leaf's quadtree takes {leaf} KB.",
             {
-                "power": Figure("emitters / baseline", {"case": "warehouse", "combination": "PowerLights + BsdfPaths"}),
+                "power": _POWER,
                 "warehouse": _pass_share("warehouse"),
                 "mine": _pass_share("mine, spot"),
                 "tracing": Figure(
@@ -105,24 +106,41 @@ def _at_equal_time(case: str, term: str, combination: str) -> Figure:
 HEADLINES = (
     Headline(
         COLUMNS,
-        "Visibility light cache",
-        "sample_reuse",
-        "Dittebrandt et al. 2020",
+        "VisibilityLightCache",
+        "samples the lights that earlier frames saw from there",
         Text(
-            "{error} times the squared error of a light hierarchy at equal time, for the many lamps of a warehouse",
+            "warehouse, many small lamps: {error} times the hierarchy's squared error at equal time",
             {"error": _at_equal_time("warehouse", "emitters", _CACHE_ALONE)},
             "targets",
         ),
+        "sample reuse",
+        "sample_reuse",
+        "Dittebrandt et al. 2020",
     ),
     Headline(
         COLUMNS,
-        "Guided paths",
-        "sample_reuse",
-        "Dittebrandt et al. 2020",
+        "GuidedPaths",
+        "sends paths where light came from in earlier frames",
         Text(
-            "{error} times the squared error of BSDF sampling at equal time, for one bounce off a sun-lit spot",
+            "mine, one bounce off a sun-lit spot: {error} times the squared error of BSDF sampling at equal time",
             {"error": _at_equal_time("mine, spot, one bounce", "indirect", _GUIDES_ALONE)},
             "targets",
         ),
+        "sample reuse",
+        "sample_reuse",
+        "Dittebrandt et al. 2020",
+    ),
+    Headline(
+        COLUMNS,
+        "LightHierarchy",
+        "selects one of many lights for each point",
+        Text(
+            "warehouse, many small lamps: lights by power have {power} times its squared error",
+            {"power": _POWER},
+            "combinations",
+        ),
+        "light hierarchy",
+        "light_hierarchy",
+        is_base=True,
     ),
 )
