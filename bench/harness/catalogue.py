@@ -1,6 +1,6 @@
 """Finds the suites and what belongs to each of them. A suite is a folder of ``bench/suites``; no list names them.
 
-Files of a suite's folder, all but the first two optional:
+Files of a suite's folder; only the first two are required:
 
 | file | holds |
 |---|---|
@@ -29,6 +29,8 @@ BENCH = Path(__file__).resolve().parents[1]
 ROOT = BENCH.parent
 """The working tree, where there is one."""
 FOLDER = BENCH / "suites"
+APART = ("compare",)
+"""Folders of ``bench`` itself whose rows have columns and plots, as those of a suite do."""
 MACHINE_SEPARATOR = ", machine"
 """Stands between a suite's name and a number where several machines ran it."""
 
@@ -44,14 +46,10 @@ def suites() -> dict[str, str]:
 
 
 def module(suite: str, file: str) -> ModuleType | None:
-    """Return a module of a suite's folder, such as "columns"; None if there is no such folder or file.
-
-    ``bench/compare`` counts as the suite "compare", which ``warp-gi bench compare`` writes rows of.
-    """
-    for folder, package in ((FOLDER, "warp_gi.bench.suites"), (BENCH, "warp_gi.bench")):
-        if suite.isidentifier() and (folder / suite / f"{file}.py").is_file():
-            return importlib.import_module(f"{package}.{suite}.{file}")
-    return None
+    """Return a module of a suite's folder, such as "columns"; None if there is no such folder or file."""
+    folder, package = (BENCH, "warp_gi.bench") if suite in APART else (FOLDER, "warp_gi.bench.suites")
+    is_there = suite.isidentifier() and (folder / suite / f"{file}.py").is_file()
+    return importlib.import_module(f"{package}.{suite}.{file}") if is_there else None
 
 
 def modules(file: str) -> Iterator[tuple[str, ModuleType]]:

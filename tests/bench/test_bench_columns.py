@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import sys
 
 import pytest
@@ -54,6 +55,14 @@ def test_every_suite_declares_its_columns(suite):
             assert column.better in (None, "higher" if column.kind is columns.RATE else "lower"), column.name
 
 
+@pytest.mark.parametrize("suite", catalogue.suites())
+def test_every_suite_has_parts_that_run(suite):
+    found = catalogue.module(suite, "suite")
+    assert callable(found.run) and catalogue.suites()[suite]
+    for name, part in getattr(found, "PARTS", {}).items():
+        assert name and (isinstance(part, str) or {"quick", "device"} <= set(inspect.signature(part).parameters))
+
+
 def test_peers_and_papers_are_not_ours_to_improve():
     for suite in catalogue.suites():
         for name, column in catalogue.columns_of(suite).by_name.items():
@@ -76,6 +85,7 @@ def test_a_column_is_found_by_name_spread_or_pattern():
 
 
 def test_a_suite_of_no_folder_has_the_columns_of_every_suite():
+    assert catalogue.module("harness", "columns") is None  # a folder beside, and no suite
     assert set(catalogue.columns_of("nobody's").by_name) == {column.name for column in columns.COMMON}
     assert catalogue.columns_of("rays, machine 2") is catalogue.columns_of("rays")
 

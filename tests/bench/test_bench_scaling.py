@@ -12,13 +12,12 @@ import warp as wp
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.bench.harness import catalogue, diff, runner
+from warp_gi.bench.harness import diff, runner
 from warp_gi.bench.report import suite_plots as report_plots
 from warp_gi.bench.report.plots import exponent
 from warp_gi.bench.suites.dvf import scaling as dvf_scaling
 from warp_gi.bench.suites.probes import scaling as probes_scaling
 from warp_gi.bench.suites.scaling import frames as scaling_frames
-from warp_gi.bench.suites.scaling import suite as scaling
 from warp_gi.bench.suites.scaling import triangles as scaling_triangles
 from warp_gi.bench.suites.scaling.columns import COLUMNS
 from warp_gi.bench.suites.scaling.fits import Growth, words
@@ -280,11 +279,6 @@ def test_speed_up_is_of_wall_seconds(monkeypatch):
 
 
 # ---- the suite ----
-
-
-def test_the_suite_is_found_and_has_its_parts():
-    assert catalogue.suites()["scaling"].startswith("Scaling: how time and memory grow")
-    assert list(scaling.PARTS) == ["triangles", "lights", "pixels", "threads", "samples", "probes"]
 
 
 def test_rows_are_told_apart(triangles):

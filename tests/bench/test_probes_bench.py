@@ -15,7 +15,6 @@ from warp_gi.bench.suites.probes import denoise as probes_denoise
 from warp_gi.bench.suites.probes import irradiance as probes_irradiance
 from warp_gi.bench.suites.probes import light as probes_light
 from warp_gi.bench.suites.probes import rays as probes_rays
-from warp_gi.bench.suites.probes import suite as probes
 from warp_gi.bench.suites.probes import views as probes_views
 from warp_gi.bench.suites.probes.columns import COLUMNS
 from warp_gi.bench.suites.probes.regions import REGIONS
@@ -269,4 +268,3 @@ def test_missing_scenes_give_rows_that_say_so(monkeypatch, tmp_path):
     monkeypatch.setattr(probes_defaults, "QUICK_CASES", (probes_defaults.CASES[0],))
     (row,) = probes_defaults.default_rows(True, "cpu")
     assert row["case"] == "living room, white sky" and "WARP_GI_SCENES" in row["skipped"]
-    assert set(probes.PARTS) == {"defaults", "rays", "leaks", "light", "bakes", "denoise"}

@@ -7,11 +7,10 @@ import pytest
 import warp as wp
 
 import warp_gi as gi
-from warp_gi.bench.harness import catalogue, scenes
+from warp_gi.bench.harness import scenes
 from warp_gi.bench.harness.gallery import Gallery
 from warp_gi.bench.suites.reuse import cost as reuse_cost
 from warp_gi.bench.suites.reuse import quality as reuse_quality
-from warp_gi.bench.suites.reuse import suite as reuse
 from warp_gi.bench.suites.reuse import time as reuse_time
 from warp_gi.bench.suites.reuse import views as reuse_views
 from warp_gi.bench.suites.reuse.columns import COLUMNS
@@ -258,8 +257,3 @@ def test_missing_scenes_give_rows_that_say_so(monkeypatch, tmp_path):
     rows = reuse_quality.quality_rows(False, "cpu")
     assert [row["case"] for row in rows if "skipped" in row] == [place.name for place in places]
     assert any("paper" in row["table"] for row in rows)
-
-
-def test_the_suite_is_found_and_has_all_parts():
-    assert catalogue.suites()["reuse"].startswith("Sample reuse")
-    assert set(reuse.PARTS) == {"quality", "adaptation", "turning", "cost", "strobe"}
