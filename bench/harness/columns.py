@@ -1,8 +1,8 @@
 """Columns of results: what the values in them are, in which unit, and what is better. Each suite declares its own.
 
-``COLUMNS = columns(suite, ...)`` in the ``columns.py`` of a suite's folder is the one place that says so. A run whose rows
-have other columns fails; plots and documents that refer to other columns fail as they are imported; ``bench --diff`` and
-tables take from it what is better, and what tells rows apart.
+``COLUMNS = columns(suite, ...)`` in the ``columns.py`` of a suite's folder is the one place that says so. A run whose
+rows have other columns fails; plots and documents that refer to other columns fail as they are imported; ``bench
+--diff`` and tables take from it what is better, and what tells rows apart.
 """
 
 from __future__ import annotations
