@@ -14,7 +14,7 @@ import warp as wp
 from statistics_tools import device
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import quad
+from warp_gi.bench.harness.scenes import quad
 from warp_gi.kernels import bsdf, light_cache, light_cache_build, light_hierarchy, ltc, samples, surface, types
 from warp_gi.kernels.emitters import LightChoice, punctual_light
 from warp_gi.launch import copied, launch

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import sphere
+from warp_gi.bench.harness.scenes import sphere
 from warp_gi.errors import OptionError
 from warp_gi.kernels.sampling import random_1d
 from warp_gi.launch import set_threads

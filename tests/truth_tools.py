@@ -13,7 +13,7 @@ from functools import cache
 import numpy as np
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import light, quad, sphere
+from warp_gi.bench.harness.scenes import light, quad, sphere
 
 MATERIALS = {  # base colour, metallic, roughness, specular
     "lambert": ((0.8, 0.5, 0.2), 0.0, 1.0, 0.0),

@@ -13,7 +13,7 @@ from statistics_tools import device, every_device  # noqa: F401
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.bench.harness.presets import light, quad, sphere
+from warp_gi.bench.harness.scenes import light, quad, sphere
 from warp_gi.kernels.bsdf import lambert
 from warp_gi.kernels.bvh import BvhHit
 from warp_gi.kernels.emitters import LightChoice

@@ -11,7 +11,7 @@ import warp as wp
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.bench.harness.presets import light, quad, sphere
+from warp_gi.bench.harness.scenes import light, quad, sphere
 from warp_gi.kernels import denoise as denoise_kernels
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_bake as bake_kernels

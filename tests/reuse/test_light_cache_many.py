@@ -23,7 +23,7 @@ from light_cache_tools import (
 from statistics_tools import device, every_device  # noqa: F401
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import light, quad
+from warp_gi.bench.harness.scenes import light, quad
 from warp_gi.kernels import light_cache, light_cache_build, samples
 from warp_gi.launch import launch
 

@@ -25,7 +25,7 @@ from truth_tools import (
 )
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import light, quad, sphere
+from warp_gi.bench.harness.scenes import light, quad, sphere
 
 WHITE_MAP = np.ones((8, 16, 3), dtype=np.float32)
 SKIES = {"constant": (1.0, 1.0, 1.0), "map": gi.Environment(pixels=WHITE_MAP)}

@@ -8,7 +8,7 @@ import statistics_tools as st
 from statistics_tools import every_device  # noqa: F401
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import quad
+from warp_gi.bench.harness.scenes import quad
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.techniques.visibility_field import audit as visibility_audit
 

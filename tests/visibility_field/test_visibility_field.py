@@ -10,7 +10,7 @@ import statistics_tools as st
 from statistics_tools import every_device  # noqa: F401
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import sphere
+from warp_gi.bench.harness.scenes import sphere
 from warp_gi.errors import BakeError, OptionError
 from warp_gi.launch import set_threads
 from warp_gi.scene import harmonics
