@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import statistics_tools as st
+from scene_tools import light, quad
 from statistics_tools import every_device  # noqa: F401
 from truth_tools import CASES, Case, lit_by, quarter_form_factor, sky_nodes
 
 import warp_gi as gi
 from warp_gi import registry
-from warp_gi.bench.harness.presets import light, quad
 
 LEARNING, FRAMES = 4, 12
 """Frames that estimators may learn in, and those that count."""
