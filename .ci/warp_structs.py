@@ -1,8 +1,8 @@
 """A plugin for mypy: lets it read classes decorated with ``@wp.struct`` as host code uses them.
 
 Mypy takes such a class for the class that its text says, which is what instances behave like. Two things are missing:
-a field of type ``wp.float32`` or ``wp.int32`` holds a Python number on the host, and the struct lists its fields in
-``vars``. Fields that are arrays or ``wp.array(dtype=...)`` stay unchecked.
+a field of type ``wp.float32`` or ``wp.int32`` holds a Python number on the host, and the struct itself has ``vars``
+and ``numpy_dtype()``. Fields declared as ``wp.array(dtype=...)`` stay unchecked.
 """
 
 from collections.abc import Callable
@@ -18,18 +18,18 @@ NUMBERS = {
 
 
 def read_struct(context: ClassDefContext) -> bool:
-    """Give the fields of a struct the types that they have on the host; return True: they are known."""
-    names = context.cls.info.names
-    for field in names.values():
+    """Give a struct's fields the types that they have on the host, add its other names, return True: all is known."""
+    info = context.cls.info
+    for field in info.names.values():
         if isinstance(field.node, Var) and isinstance(field.node.type, Instance):
             number = NUMBERS.get(field.node.type.type.fullname)
             if number:
                 field.node.type = context.api.named_type(number, [])
-    any_type = AnyType(TypeOfAny.explicit)
-    fields = Var("vars", context.api.named_type("builtins.dict", [context.api.named_type("builtins.str", []), any_type]))
-    fields.info = context.cls.info
-    fields.is_classvar = True
-    names["vars"] = SymbolTableNode(MDEF, fields)
+    for name in ("vars", "numpy_dtype"):
+        added = Var(name, AnyType(TypeOfAny.explicit))
+        added.info = info
+        added.is_classvar = True
+        info.names[name] = SymbolTableNode(MDEF, added)
     return True
 
 
