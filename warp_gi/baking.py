@@ -243,9 +243,9 @@ def _stored(name: str, array: np.ndarray) -> np.ndarray:
     return np.asarray(array, array.dtype.newbyteorder("<"), order="C")
 
 
-def _bytes(array: np.ndarray) -> np.ndarray:
-    """Return a view of a contiguous array's bytes, uint8 [nbytes]."""
-    return array.reshape(-1).view(np.uint8)
+def _bytes(array: np.ndarray) -> memoryview:
+    """Return a view of a contiguous array's bytes."""
+    return array.reshape(-1).view(np.uint8).data
 
 
 def _digest(arrays: Mapping[str, np.ndarray]) -> str:
