@@ -6,6 +6,7 @@ import contextlib
 import mmap
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -80,8 +81,8 @@ class TriangleBvh:
         self.triangle_count = len(corners)
         self.vertex_count = len(positions)
         self.data = types.Bvh()
-        self._positions = wp.array(positions, dtype=wp.vec3, device=self.device)
-        self._indices = wp.array(corners.astype(np.int32), dtype=wp.vec3i, device=self.device)
+        self._positions: wp.array = wp.array(positions, dtype=wp.vec3, device=self.device)
+        self._indices: wp.array = wp.array(corners.astype(np.int32), dtype=wp.vec3i, device=self.device)
         self._alpha = alpha
         if alpha is not None:
             self._set_alpha(alpha)
@@ -138,7 +139,7 @@ class TriangleBvh:
         count = len(rays.origins)
         if count != len(rays.directions):
             raise SceneError(f"expected as many ray directions as origins ({count}), got {len(rays.directions)}")
-        limits = t_max if isinstance(t_max, wp.array) else np.atleast_1d(_as_numpy(t_max)).astype(np.float32)
+        limits: Any = t_max if isinstance(t_max, wp.array) else np.atleast_1d(_as_numpy(t_max)).astype(np.float32)
         if limits.ndim != 1 or len(limits) not in (1, count):
             raise SceneError(f"t_max must be a number or one for each of {count} rays, got shape {limits.shape}")
         rays.t_max = wp.array(limits, dtype=wp.float32, device=self.device, copy=False)
@@ -227,10 +228,11 @@ def _block_parents(nodes: wp.array, block_count: int) -> np.ndarray:
 def _make_mesh(points: wp.array, corners: np.ndarray, positions: np.ndarray) -> wp.Mesh:
     """Return the wp.Mesh of the CUDA path, its zero-area triangles shrunk to a point, which no ray hits."""
     a, b, c = (positions[corners[:, k]].astype(np.float64) for k in range(3))
-    flat = ~np.cross(b - a, c - a).any(axis=1)
+    flat = np.logical_not(np.cross(b - a, c - a).any(axis=1))
     corners = np.where(flat[:, None], corners[:, :1], corners)
-    indices = wp.array(np.ascontiguousarray(corners, dtype=np.int32).ravel(), dtype=wp.int32, device=points.device)
-    if points.device.is_cpu:
+    device = wp.get_device(points.device)
+    indices: wp.array = wp.array(np.ascontiguousarray(corners, dtype=np.int32).ravel(), dtype=wp.int32, device=device)
+    if device.is_cpu:
         return wp.Mesh(points, indices, bvh_constructor="sah", bvh_leaf_size=4)
     return wp.Mesh(points, indices)
 
@@ -255,7 +257,8 @@ def _as_numpy(value: object) -> np.ndarray:
     if isinstance(value, wp.array):
         return value.numpy()
     if hasattr(value, "__dlpack__"):
-        return wp.from_dlpack(value).numpy()
+        shared: Any = wp.from_dlpack(value)
+        return shared.numpy()
     return np.asarray(value)
 
 

@@ -16,11 +16,11 @@ from warp_gi import launch
 from warp_gi.errors import unknown_name
 from warp_gi.kernels import denoise, gbuffer, path_samplers, path_trace, types
 from warp_gi.paths import PathRequest, sky_probability
+from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.pinhole import camera_data
 
 if TYPE_CHECKING:
-    from warp_gi.scene.baked import BakedScene
     from warp_gi.scene.scene import Scene
 
 TERMS = ("environment", "emitters", "indirect")
@@ -229,7 +229,7 @@ class Frame:
         if request.table is not None:
             self.data.emitters.alias = request.table
         elif self.scene.emitter_count and request.lights.sampler is path_samplers.ALIAS_LIGHTS:
-            self.data.emitters.alias = self.scene.light_table(self.device)
+            self.data.emitters.alias = whole_scene(self.scene).light_table(self.device)
         tracer = path_trace.path_tracer(*request.samplers())
         samplers = tracer.samplers()
         for name in tracer.samplers.vars:

@@ -177,7 +177,7 @@ def _check(kernel: wp.Kernel, inputs: Sequence[object], device: wp.Device) -> No
             raise TypeError(f"kernel {kernel.key}, argument {argument.label}: {problem}")
 
 
-def _mismatch(expected: object, value: object, device: wp.Device) -> str | None:
+def _mismatch(expected: Any, value: object, device: wp.Device) -> str | None:
     if isinstance(expected, wp.array):
         if value is None:
             return None
@@ -193,7 +193,7 @@ def _mismatch(expected: object, value: object, device: wp.Device) -> str | None:
             return f"expected an array on {device}, got one on {value.device}"
         return None
     if hasattr(expected, "vars") and hasattr(expected, "cls"):  # a wp.struct
-        struct = getattr(value, "_cls", None)
+        struct: Any = getattr(value, "_cls", None)
         if struct is not expected:
             return f"expected struct {expected.key}, got {getattr(struct, 'key', type(value).__name__)}"
         for name, variable in expected.vars.items():

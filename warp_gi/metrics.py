@@ -79,11 +79,11 @@ def flip_map(
 def _ldr_flip(a: np.ndarray, r: np.ndarray, pixels_per_degree: float) -> np.ndarray:
     import OpenImageIO as oiio
 
-    a, r = (oiio.ImageBuf(np.ascontiguousarray(np.clip(x, 0, 1), np.float32)) for x in (a, r))
-    result = oiio.ImageBufAlgo.FLIP_diff(r, a, hdr=0, ppd=pixels_per_degree)
+    seen, wanted = (oiio.ImageBuf(np.ascontiguousarray(np.clip(x, 0, 1), np.float32)) for x in (a, r))
+    result = oiio.ImageBufAlgo.FLIP_diff(wanted, seen, hdr=0, ppd=pixels_per_degree)
     if result.has_error:
         raise OptionError(f"FLIP: {one_line(result.geterror())}")
-    return np.ascontiguousarray(result.get_pixels(oiio.FLOAT)[:, :, 0])
+    return np.ascontiguousarray(np.asarray(result.get_pixels(oiio.FLOAT))[:, :, 0])
 
 
 # Narkowicz's fit of the ACES curve with FLIP's exposure of 0.6 folded in: (x(ax + b)) / (x(dx + e) + f)

@@ -10,9 +10,9 @@ import warp as wp
 
 from warp_gi.color import LUMINANCE
 from warp_gi.kernels import path_samplers, path_trace
+from warp_gi.scene.baked import BakedScene
 
 if TYPE_CHECKING:
-    from warp_gi.scene.baked import BakedScene
     from warp_gi.scene.scene import Scene
 
 TERM_BITS = {
@@ -129,7 +129,7 @@ def sky_probability(scene: Scene | BakedScene) -> float:
     A sky sends pi radius^2 times its integral over the sphere into the scene; walls keep most of that out of a room.
     """
     environment = scene.environment
-    if environment is None or environment.pixels is None:
+    if isinstance(scene, BakedScene) or environment is None or environment.pixels is None:
         return 0.0
     if scene.emitter_count == 0:
         return 1.0

@@ -187,8 +187,8 @@ def run(options: BakeOptions, report: Reporter) -> None:
             files = tool.export(result, options.export)
         more = f" to {files[-2].name}" * (len(files) > 2)
         report.line(f"{tool.exported}: {files[0]}{more}, described by {files[-1]}")
-    if options.show is not None:
-        show(options, scene, camera, result, report)
+    if options.show is not None and camera is not None:
+        show(options, options.show, scene, camera, result, report)
     rows = [*tool.rows(result, seconds), ("file [MB]", output.stat().st_size / 1e6)]
     report.table("bake", ("quantity", "value"), rows)
     for table in tool.tables(result):
@@ -198,16 +198,18 @@ def run(options: BakeOptions, report: Reporter) -> None:
     report.line(f"bake: {output}")
 
 
-def show(options: BakeOptions, scene: Scene, camera: Camera | CameraPath, result: Bake, report: Reporter) -> None:
-    """Write pictures of a bake, in the first view of the camera."""
+def show(
+    options: BakeOptions, folder: Path, scene: Scene, camera: Camera | CameraPath, result: Bake, report: Reporter
+) -> None:
+    """Write pictures of a bake to a folder, in the first view of the camera."""
     tool = tool_of(options.technique)
     if tool.needs_sky and (scene.environment is None or scene.environment.is_black):
         report.line("there is no sky: the pictures are made under a white one")
         scene.environment = 1.0
     view = camera.camera(0) if isinstance(camera, CameraPath) else camera
     with report.phase("pictures"):
-        tool.write_pictures(scene, view, result, options.settings, options.show, options.device, options.seed)
-    report.line(f"pictures: {options.show}")
+        tool.write_pictures(scene, view, result, options.settings, folder, options.device, options.seed)
+    report.line(f"pictures: {folder}")
 
 
 def default_output(options: BakeOptions) -> Path:

@@ -59,7 +59,7 @@ def main(arguments: Sequence[str]) -> int:
     _check(options)
     if options.diff is not None:
         return diff.diff_files(*options.diff, options.tolerance)
-    if options.report:
+    if options.report and options.html is not None:  # both, as _check has seen to
         write_html(options.html, records.read(options.report))
     elif options.suite == ALL:
         return _run_all(options)

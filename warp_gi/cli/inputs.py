@@ -13,6 +13,7 @@ import tyro
 
 from warp_gi.cli.options import flag
 from warp_gi.errors import OptionError, unknown_name
+from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.builtin import BUILTIN_SCENES, builtin_camera_path, builtin_scene
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.environment import Environment, SunSky, as_environment
@@ -94,19 +95,19 @@ def parse_environment(options: SceneOptions) -> Environment:
     return sky.rotated(options.environment_rotation)
 
 
-def find_camera(options: SceneOptions, scene: Scene, report: Reporter) -> Camera | CameraPath:
+def find_camera(options: SceneOptions, scene: Scene | BakedScene, report: Reporter) -> Camera | CameraPath:
     """Return the camera or path that was asked for."""
-    if (options.eye is None) != (options.target is None):
-        raise OptionError("--eye and --target go together; give both")
     if options.hfov is not None and not 0.0 < options.hfov < 180.0:
         raise OptionError(f"--hfov must be between 0 and 180 degrees, got {options.hfov:g}")
-    if options.eye is not None:
+    if options.eye is not None or options.target is not None:
+        if options.eye is None or options.target is None:
+            raise OptionError("--eye and --target go together; give both")
         if options.camera:
             raise OptionError("--camera and --eye exclude each other; give one")
         return Camera.look_at(options.eye, options.target, hfov=options.hfov or 65.0)
     camera: Camera | CameraPath
     if options.camera in scene.cameras:
-        camera = scene_camera(scene, options.camera)
+        camera = scene_camera(whole_scene(scene), options.camera)
     elif options.camera.lower().endswith(".json"):
         camera = CameraPath.load(options.camera)
     elif options.camera in BUILTIN_SCENES:
@@ -115,9 +116,9 @@ def find_camera(options: SceneOptions, scene: Scene, report: Reporter) -> Camera
         raise unknown_name("camera", options.camera, [*scene.cameras, *BUILTIN_SCENES, "a .json file"])
     elif (options.scene or DEFAULT_SCENE) in BUILTIN_SCENES:
         camera = builtin_camera_path(options.scene or DEFAULT_SCENE)
-    elif scene.name in BUILTIN_SCENES and not scene.triangle_count:  # a bake of it
+    elif scene.name in BUILTIN_SCENES and isinstance(scene, BakedScene):
         camera = builtin_camera_path(scene.name)
-    elif not scene.triangle_count:
+    elif isinstance(scene, BakedScene):
         raise OptionError("a bake has no camera; give --camera or --eye and --target, inside of the scene")
     elif scene.cameras:
         camera = scene_camera(scene, next(iter(scene.cameras)))

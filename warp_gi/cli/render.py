@@ -23,7 +23,7 @@ from warp_gi.cli.inputs import (
 )
 from warp_gi.cli.interrupts import stoppable
 from warp_gi.cli.options import flag, parse_options, value_given
-from warp_gi.cli.pipelines import denoiser_named, pipeline_named
+from warp_gi.cli.pipelines import find_denoiser, pipeline_named
 from warp_gi.cli.report import Reporter, run_command
 from warp_gi.errors import OptionError
 from warp_gi.files import check_writable
@@ -110,7 +110,7 @@ def parse(arguments: Sequence[str]) -> Render:
     is_bake = any(a.endswith(BAKE_SUFFIX) and b != "--bake" for a, b in zip(arguments, before, strict=False))
     settings = pipeline_named(value_given(arguments, "--pipeline") or ("probe_view" if is_bake else "path"))
     if denoiser := value_given(arguments, "--denoise"):
-        settings = replace(settings, denoise=denoiser_named(denoiser))
+        settings = replace(settings, denoise=find_denoiser(denoiser))
     options = parse_options(Render, "render", arguments, DESCRIPTION, Render(settings=settings))
     if not options.scene and not {"--preview", "--no-preview"} & set(arguments):
         options.preview = True

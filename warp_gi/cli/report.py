@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 import warp as wp
 
@@ -195,7 +195,7 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]
         for index in part:
             more = max(min(max(map(len, (columns[index], *cells[index]))) - widths[index], room), 0)
             room -= more
-            justify = "right" if numeric[index] else "left"
+            justify: Literal["left", "right"] = "right" if numeric[index] else "left"
             table.add_column(columns[index], justify=justify, overflow="fold", width=widths[index] + more)
         for row in rows:
             table.add_row(*(row[index] for index in part))

@@ -229,7 +229,7 @@ class Edits:
         for _, mesh, slot in self._meshes():
             if field is None and mesh.material is material and not _alike(material, scene.materials[slot.row]):
                 field = hint  # of a material that meshes have in place of the scene's own
-        return field and Edit(f"{field} of material {material.name!r} changed")
+        return None if field is None else Edit(f"{field} of material {material.name!r} changed")
 
     def _emission_edit(self) -> Edit | None:
         """Return whether other triangles emit than when the scene was made; materials are read later."""
@@ -274,7 +274,8 @@ class Edits:
         is_other = sky._map is not used
         if used is not None:
             is_other |= used.is_edited()
-            is_other |= sky.pixels is not used.pixels and not np.array_equal(sky.pixels, used.pixels)
+            pixels = sky.pixels
+            is_other |= pixels is None or (pixels is not used.pixels and not np.array_equal(pixels, used.pixels))
         else:
             is_other |= sky.pixels is not None
         if is_other:
@@ -326,7 +327,7 @@ def _row_edit(material: Material, data: Any, row: int, hint: str) -> str | None:
         return hint
     images = textures.distinct_textures([material])
     new, old = textures.material_table([material], images)[0], data.materials.numpy()[row]
-    for field in new.dtype.names:
+    for field in new.dtype.names or ():
         if field not in textures.TEXTURE_SLOTS:
             if not np.array_equal(new[field], old[field]):
                 return field
@@ -335,8 +336,9 @@ def _row_edit(material: Material, data: Any, row: int, hint: str) -> str | None:
         elif new[field] >= 0:
             entry, image = data.textures.numpy()[old[field]], images[new[field]]
             table, texels = textures.texture_table([image])
-            start = int(entry[table.dtype.names[0]])
-            is_same = all(entry[name] == table[0][name] for name in table.dtype.names[1:])
+            first, *others = table.dtype.names or ()
+            start = int(entry[first])
+            is_same = all(entry[name] == table[0][name] for name in others)
             if not is_same or not np.array_equal(data.texels.numpy()[start : start + len(texels)], texels):
                 return f"{field} {image.name!r}"
     return None

@@ -72,7 +72,7 @@ def emissive_triangles(flat: FlatGeometry, materials: Sequence[Material]) -> tup
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     powers = np.pi * 0.5 * np.linalg.norm(cross.astype(np.float64), axis=1)
     powers[powers < np.pi * SMALLEST_AREA] = 0.0
-    for index in np.flatnonzero(shining):
+    for index in np.flatnonzero(shining).tolist():
         mine = flat.materials[triangles] == index
         material = materials[index]
         radiance = np.asarray(material.emission, np.float64)
@@ -106,7 +106,7 @@ def emitter_table(triangles: np.ndarray, lights: Sequence[PunctualLight], world:
         direction = matrix[:3, :3] @ np.asarray(light.direction, np.float64)
         row["kind"] = LIGHT_KINDS[light.kind]
         row["position"] = matrix[:3, :3] @ np.asarray(light.position, np.float64) + matrix[:3, 3]
-        row["direction"] = direction / max(np.linalg.norm(direction), 1e-30)
+        row["direction"] = direction / max(float(np.linalg.norm(direction)), 1e-30)
         row["intensity"] = light.intensity
         row["cos_inner"], row["cos_outer"] = np.cos(light.inner_cone), np.cos(light.outer_cone)
         row["range"] = light.range or 0.0

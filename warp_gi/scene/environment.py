@@ -44,12 +44,12 @@ class _Map:
 
     def __init__(self, pixels: np.ndarray) -> None:
         self.pixels = pixels
-        self.arrays: dict[str, tuple[wp.array, ...]] = {}
+        self.arrays: dict[str, tuple[wp.array, wp.array, float]] = {}
         self.watch: Watch | None = None
 
     @cached_property
     def digest(self) -> bytes:
-        return hashlib.sha256(np.int64(self.pixels.shape).tobytes() + self.pixels.tobytes()).digest()
+        return hashlib.sha256(np.array(self.pixels.shape, np.int64).tobytes() + self.pixels.tobytes()).digest()
 
     @cached_property
     def mean(self) -> np.ndarray:

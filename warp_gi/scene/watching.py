@@ -103,13 +103,13 @@ class _Checksums:
             table["address"] = starts[self.index] + offset.astype(np.uint64)
             table["size"] = np.minimum(sizes[self.index] - offset, CHUNK)
         self.device = get_device("cpu")
-        self.chunks = wp.array(table, dtype=checksum.MemoryChunk, device=self.device, copy=False)
+        self.chunks: wp.array = wp.array(table, dtype=checksum.MemoryChunk, device=self.device, copy=False)
         self.sums = self._compute()
 
     def _compute(self) -> np.ndarray:
         sums = np.zeros(len(self.index), np.uint64)
         if len(sums):  # one launch: memory limits it, not a core
-            target = wp.array(sums, dtype=wp.uint64, device=self.device, copy=False)
+            target: wp.array = wp.array(sums, dtype=wp.uint64, device=self.device, copy=False)
             launch(checksum.sum_chunks, len(sums), [self.chunks, target], self.device, smallest_slice=len(sums))
         return sums
 
@@ -141,4 +141,4 @@ def _crc(value: Any) -> int:
     array = np.asarray(value)
     if array.dtype.kind not in "biuf":
         return 0
-    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8), array.nbytes)
+    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data, array.nbytes)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import importlib
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from warp_gi.errors import unknown_name
@@ -42,7 +43,7 @@ def builtin_camera_path(name: str) -> CameraPath:
     return _module(name).camera_path()
 
 
-def _module(name: str) -> object:
+def _module(name: str) -> ModuleType:
     if name not in BUILTIN_SCENES:
         raise unknown_name("built-in scene", name, BUILTIN_SCENES)
     return importlib.import_module(f"warp_gi.scene.builtin.{name}")

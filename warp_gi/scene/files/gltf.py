@@ -59,7 +59,7 @@ class _Reader:
         nodes: list[Node] = []
         sources: list[Any] = []
         names: set[str] = set()
-        pending = [(index, None) for index in reversed(self._roots())]
+        pending: list[tuple[int, int | None]] = [(index, None) for index in reversed(self._roots())]
         seen: set[int] = set()
         while pending:
             index, parent = pending.pop()

@@ -112,7 +112,7 @@ class Buffers:
             rows = self._read(where.bufferView, where.byteOffset or 0, number, 1, kind, None, index)[:, 0]
             values[rows] = self._read(what.bufferView, what.byteOffset or 0, number, width, dtype, None, index)
         if description.normalized and dtype.kind in "iu":
-            values = np.maximum(values.astype(np.float32) / np.iinfo(dtype).max, -1.0)
+            values = np.maximum(values.astype(np.float32) / np.iinfo(dtype.name).max, -1.0)
         return values[:, 0] if width == 1 else values
 
     def _read(

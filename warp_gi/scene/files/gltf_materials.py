@@ -40,7 +40,7 @@ class MaterialReader:
         name = source.name or f"material {index}"
         extensions = source.extensions or {}
         surface = source.pbrMetallicRoughness
-        color = list(surface.baseColorFactor or (1.0,) * 4) if surface else [1.0] * 4
+        red, green, blue, alpha = (surface and surface.baseColorFactor) or (1.0,) * 4
         strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
         cutoffs = {"OPAQUE": None, "MASK": 0.5 if source.alphaCutoff is None else source.alphaCutoff}
         specular = extensions.get("KHR_materials_specular", {})
@@ -48,8 +48,8 @@ class MaterialReader:
         normal = source.normalTexture
         return Material(
             name,
-            base_color=tuple(color[:3]),
-            alpha=color[3],
+            base_color=(red, green, blue),
+            alpha=alpha,
             metallic=1.0 if surface is None or surface.metallicFactor is None else surface.metallicFactor,
             roughness=1.0 if surface is None or surface.roughnessFactor is None else surface.roughnessFactor,
             specular=specular.get("specularFactor", 1.0),
@@ -73,10 +73,11 @@ class MaterialReader:
                 raise SceneError(
                     f"{str(self.buffers.path)!r}: texture {info.index} of material {material!r} has no image"
                 )
-            wrap = ("repeat", "repeat")
+            wrap: tuple[str, str] = ("repeat", "repeat")
             if texture.sampler is not None:
                 sampler = self.document.samplers[texture.sampler]
-                wrap = tuple(WRAP_MODES.get(mode or 10497, str(mode)) for mode in (sampler.wrapS, sampler.wrapT))
+                u, v = (WRAP_MODES.get(mode or 10497, str(mode)) for mode in (sampler.wrapS, sampler.wrapT))
+                wrap = u, v
             image = self.document.images[texture.source]
             name = texture.name or image.name or (image.uri or "")[:80] or f"image {texture.source}"
             if name.startswith("data:"):
