@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from warp_gi.baking import Bake
     from warp_gi.estimator import Estimator
     from warp_gi.scene.scene import Scene
-    from warp_gi.scheduler import Frame
+    from warp_gi.frame import Frame
 
 Progress = Callable[[str, float], None]
 
