@@ -262,15 +262,15 @@ def test_a_moving_object_is_never_wrong_and_is_baked_again_when_it_rests(mode):
     field = gi.VisibilityField(mode, **(SMALL | {"samples": 40_000}), **sky, budget=50.0)
     scheduler = gi.FrameScheduler(moving_scene(), path, pipeline(field), st._device)
     other = gi.FrameScheduler(moving_scene(), path, pipeline(gi.VisibilityField("traced", **sky)), st._device)
-    rest = []
+    settled = []
     for index in range(9):
         picture, truth = scheduler.frame(index).numpy("environment"), other.frame(index).numpy("environment")
-        rest.append(len(scheduler.state("environment").rest))
+        settled.append(len(scheduler.state("environment").settled.known))
         if mode != "unbiased":
             assert np.sqrt(np.mean((picture - truth) ** 2)) < 2e-3, index
         else:
             assert abs(picture.mean() / truth.mean() - 1) < 0.01
-    assert not any(rest[:5]) and rest[8] >= rest[6] > 0, rest
+    assert not any(settled[:5]) and settled[8] >= settled[6] > 0, settled
 
 
 def test_a_bake_is_used_saved_and_refused(tmp_path):
