@@ -299,8 +299,8 @@ def test_a_field_grown_on_the_way_goes_on_bit_for_bit(tmp_path):
     """The state after two frames, saved and loaded, renders the third as an unbroken run does."""
     scene, field = courtyard(), gi.VisibilityField(**SMALL, budget=0.5)
     path = gi.CameraPath.still(view())
-    whole = gi.FrameScheduler(scene, path, pipeline(field), st._device)
-    whole._bakes = {"environment": gi.bake(scene, field, st._device, camera_path=replace(view(), hfov=8.0))}
+    bake = gi.bake(scene, field, st._device, camera_path=replace(view(), hfov=8.0))
+    whole = gi.FrameScheduler(scene, path, pipeline(field), st._device, bakes=[bake])
     images = [whole.frame(index).numpy("environment").copy() for index in range(2)]
     saved = gi.load_bake(whole.state("environment").to_bake().save(tmp_path / "two"))
     images.append(whole.frame(2).numpy("environment").copy())

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+import threading
+from typing import TYPE_CHECKING
 
 import numpy as np
+import warp as wp
 
 from warp_gi.baking import Bake
-from warp_gi.errors import BakeError
+from warp_gi.errors import BakeError, OptionError
 from warp_gi.forks import Guard
 from warp_gi.kernels import types
+
+if TYPE_CHECKING:
+    from warp_gi.scene.pinhole import Camera
+    from warp_gi.scene.scene import Scene
 
 
 class BakedScene:
@@ -36,10 +42,10 @@ class BakedScene:
         self.name = bake.scene_name
         self.contents_hash = bake.scene_key
         self.hash = bake.digest
-        self.cameras: dict[str, Any] = {}
+        self.cameras: dict[str, Camera] = {}
 
     @property
-    def lock(self) -> Any:
+    def lock(self) -> threading.RLock:
         """A re-entrant lock, as that of a ``Scene``."""
         return self._guard.lock
 
@@ -48,7 +54,7 @@ class BakedScene:
         """Lowest and highest corner, float32 [2, 3], metres."""
         return self.bake.arrays["bounds"]
 
-    def update(self, *times: Any) -> bool:
+    def update(self, time: float, previous_time: float | None = None, device: wp.DeviceLike = None) -> bool:
         """Return False: nothing moves."""
         return False
 
@@ -59,6 +65,13 @@ class BakedScene:
     def check_unchanged(self) -> None:
         """Do nothing: there is nothing to edit."""
 
-    def data(self, device: Any = None) -> types.SceneData:
+    def data(self, device: wp.DeviceLike = None) -> types.SceneData:
         """Return buffers that hold nothing."""
         return types.SceneData()
+
+
+def whole_scene(scene: Scene | BakedScene) -> Scene:
+    """Return a scene that has geometry and lights; raises OptionError for one of which only a bake is left."""
+    if isinstance(scene, BakedScene):
+        raise OptionError(f"only a bake of {scene.name!r} was given, but this needs the scene itself; give the scene")
+    return scene

@@ -47,7 +47,7 @@ class LightFieldTool(BakeTool):
     def check_scene(self, settings: LightFieldProbes, scene: Scene) -> None:
         """Raise OptionError for too many probes, where their counts are given; else the bake finds out."""
         if all(settings.counts):
-            probe_grid(scene.bounds, settings.counts, settings.spacing, settings.largest_map)
+            probe_grid(scene.bounds, settings.counts, settings.spacing, settings.probe_settings.largest_map)
 
     def check_export_name(self, path: Path) -> None:
         """Raise OptionError unless the file is an .exr."""
