@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from warp_gi.baking import Bake
+from warp_gi.denoise import SpatioTemporal
 from warp_gi.frame import Frame
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_march as march_kernels
@@ -72,7 +73,7 @@ def write_pictures(
         seed: Seed of the view.
     """
     shown = replace(settings, mode="irradiance", primary="geometry", update=0)
-    pipeline = Pipeline(indirect=shown, spp=SHOW_SAMPLES, denoise="spatiotemporal")
+    pipeline = Pipeline(indirect=shown, spp=SHOW_SAMPLES, denoise=SpatioTemporal())
     scheduler = FrameScheduler(scene, camera, pipeline, device, seed, bakes=[bake])
     frame = scheduler.frame(0)
     state = scheduler.state("indirect")

@@ -24,10 +24,11 @@ from warp_gi.scene.scene import Scene
 
 LANES = kernels.LANES
 EMPTY = np.iinfo(np.int64).min
-"""In place of a child, while a tree is built."""
+"""Stands for no child while a tree is built."""
 BINS = 12
+"""Bins along each axis that a node's lights are sorted into to find its cheapest split."""
 FEW_LIGHTS, FEW_BINS = 8, 6
-"""A node of at most so many lights is split over fewer bins."""
+"""Largest number of lights of a node that is split over fewer bins, and the number of those bins."""
 USUAL_DEPTH = 40
 """Levels of the binary tree before halves are taken; where that is too deep for a path, halves are taken earlier."""
 NARROW_AREA = 1e-2
@@ -35,31 +36,31 @@ NARROW_AREA = 1e-2
 EQUAL_COST = 1e-30
 """Added to a node's cost for each of its lights, so that those without extent are opened evenly."""
 CACHE_LINE = 64
-"""Bytes."""
+"""Bytes of a cache line, on which nodes begin."""
 MARGIN = 1e-6
-"""By which boxes are larger, in units of the largest coordinate, for the rounding of positions."""
+"""Distance by which boxes are larger than their lights, for rounding, as a share of the largest coordinate."""
 
 
 @dataclass(frozen=True, eq=False)
 class EmitterBounds:
-    """What a tree knows of each emitter; all but ``directional`` counts only for emitters with a place."""
+    """What a tree knows of each emitter. Of directional lights, only ``directional`` and ``flux`` are read."""
 
     low: np.ndarray
-    """float64 [emitter, 3], metres."""
+    """float64 [emitter, 3]: lowest corner of the emitter's box, metres."""
     high: np.ndarray
-    """float64 [emitter, 3], metres."""
+    """float64 [emitter, 3]: highest corner of the emitter's box, metres."""
     axis: np.ndarray
-    """float64 [emitter, 3] unit: the way it faces."""
+    """float64 [emitter, 3]: unit vector, the direction that the emitter faces."""
     facing: np.ndarray
-    """float64 [emitter] half angle of the cone of directions it faces (theta_o), radians."""
+    """float64 [emitter]: half angle of the cone of directions that the emitter faces (theta_o), radians."""
     falloff: np.ndarray
-    """float64 [emitter] how far beyond that cone it shines (theta_e), radians."""
+    """float64 [emitter]: angle beyond that cone at which the emitter still shines (theta_e), radians."""
     power: np.ndarray
-    """float64 [emitter] luminance of the intensity straight ahead, W/sr; 0 is never selected."""
+    """float64 [emitter]: luminance of the intensity straight ahead, W/sr; an emitter of 0 is never selected."""
     directional: np.ndarray
-    """bool [emitter] without a place."""
+    """bool [emitter]: whether the light is directional, without a place."""
     flux: np.ndarray
-    """float64 [emitter] W, which decides between directional lights, and between those and the tree."""
+    """float64 [emitter]: W, which decides between directional lights, and between those and the tree."""
 
     @property
     def in_tree(self) -> np.ndarray:
@@ -72,25 +73,31 @@ class TreeArrays:
     """A tree on the host: nodes in order of their level, the root first. Lanes past a node's last child are empty."""
 
     child: np.ndarray
-    """int32 [node, 8]: node, or the complement of an emitter's index; 0 in an empty lane."""
+    """int32 [node, 8]: index of a node, or the complement of an emitter's index; 0 in an empty lane."""
     child_count: np.ndarray
-    """int64 [node]"""
+    """int64 [node]: number of children."""
     level_starts: np.ndarray
     """int64 [level + 1]: first node of each level, and the number of nodes."""
     paths: np.ndarray
-    """int64 [emitter], see LightTree.paths."""
+    """int64 [emitter]: way from the root to each emitter, see ``LightTree.paths``."""
     low: np.ndarray
-    """float64 [node, 8, 3] of each child, as are the rest; see EmitterBounds."""
+    """float64 [node, 8, 3]: lowest corner of each child's box, metres."""
     high: np.ndarray
+    """float64 [node, 8, 3]: highest corner of each child's box, metres."""
     axis: np.ndarray
+    """float64 [node, 8, 3]: unit axis of the cone around the directions that each child's lights face."""
     facing: np.ndarray
+    """float64 [node, 8]: half angle of that cone, radians."""
     falloff: np.ndarray
+    """float64 [node, 8]: largest angle beyond the cone at which a light of the child shines, radians."""
     power: np.ndarray
+    """float64 [node, 8]: sum of the powers of each child's lights, W/sr."""
     directional: np.ndarray
-    """int32 [number]: emitters without a place."""
+    """int32 [number]: indices of directional emitters."""
     directional_flux: np.ndarray
-    """float64 [number]"""
+    """float64 [number]: flux of those emitters, W."""
     directional_probability: float
+    """Probability of sampling a directional emitter rather than the tree."""
 
 
 def emitter_bounds(scene: Scene, device: str | wp.Device) -> EmitterBounds:
@@ -168,7 +175,10 @@ def build_tree(bounds: EmitterBounds) -> TreeArrays:
 
 
 def refit_tree(tree: TreeArrays, bounds: EmitterBounds) -> TreeArrays:
-    """Return a tree of the same topology around lights that moved; which emitters have power must not change."""
+    """Return a tree of the same topology around lights that moved.
+
+    The same emitters must have power as when it was built.
+    """
     tree = replace(
         tree,
         **{name: getattr(tree, name).copy() for name in ("low", "high", "axis", "facing", "falloff", "power")},
@@ -193,7 +203,7 @@ def refit_tree(tree: TreeArrays, bounds: EmitterBounds) -> TreeArrays:
 
 
 def to_device(tree: TreeArrays, device: wp.Device) -> kernels.LightTree:
-    """Return what kernels read."""
+    """Return a tree as kernels read it."""
     node_count = len(tree.child)
     used = np.arange(LANES) < tree.child_count[:, None]
     low, high = (np.where(used[..., None], corner, 0.0) for corner in (tree.low, tree.high))
@@ -228,7 +238,8 @@ def to_device(tree: TreeArrays, device: wp.Device) -> kernels.LightTree:
 def _binary_tree(bounds: EmitterBounds, lights: np.ndarray, most_levels: int) -> tuple[np.ndarray, np.ndarray]:
     """Return children (int64 [node, 2]: node, or complement of an emitter) and costs (float64 [node]) of inner nodes.
 
-    Nodes are split in order of their level; from where even halves just reach ``most_levels`` on, halves are taken.
+    Nodes are split in order of their level. Where splitting a node into halves from there on just keeps within
+    ``most_levels``, it is split into halves.
     """
     centers = (bounds.low[lights] + bounds.high[lights]) / 2
     # enough for a heuristic, and half the memory traffic
@@ -283,7 +294,10 @@ def _split(
     begin: np.ndarray,
     counts: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return on which side of its node's cheapest split each light lies (bool), and the cost of each node unsplit."""
+    """Return whether each light lies on the far side of its node's cheapest split, and the cost of nodes unsplit.
+
+    The first is bool [light], the second float [node].
+    """
     side = np.zeros(len(emitters), bool)
     cost = np.zeros(len(begin))
     few = counts <= FEW_LIGHTS
@@ -300,6 +314,7 @@ def _split(
 def _binned_split(
     bounds: EmitterBounds, emitters: np.ndarray, centers: np.ndarray, node: np.ndarray, begin: np.ndarray, bins: int
 ) -> tuple[np.ndarray, np.ndarray]:
+    """Return the same as ``_split`` for nodes that are all split over so many bins."""
     count = len(begin)
     least, most = np.minimum.reduceat(centers, begin), np.maximum.reduceat(centers, begin)
     extent = most - least
@@ -350,7 +365,7 @@ def _binned_split(
 def _running_cost(
     low: np.ndarray, high: np.ndarray, power: np.ndarray, axis: np.ndarray, facing: np.ndarray, falloff: np.ndarray
 ) -> np.ndarray:
-    """Return power times area times solid angle of bins 0 to k together, [node, axis, k].
+    """Return the cost of bins 0 to k together, power times area times solid angle, float [node, axis, k].
 
     The cone of bins 0 to k is about their mean axis; its angle is bounded by how far the axis turned since each bin.
     """
@@ -378,7 +393,7 @@ def _solid_angle(facing: np.ndarray, falloff: np.ndarray) -> np.ndarray:
 
 
 def _collapse(children: np.ndarray, costs: np.ndarray) -> list[np.ndarray]:
-    """Return the nodes of each level, int64 [node, 8], from a binary tree's; EMPTY where there is no child."""
+    """Return the children of the nodes of each level, int64 [node, 8], of a binary tree; EMPTY where there is none."""
     levels, roots, first_child = [], np.array([0]), 0
     while len(roots):
         lanes = np.full((len(roots), LANES), EMPTY)
@@ -434,6 +449,7 @@ def _cone_union(
 
 
 def _starts(counts: np.ndarray) -> np.ndarray:
+    """Return where each run of items begins if runs of ``counts`` items stand one after another."""
     return np.cumsum(counts) - counts
 
 

@@ -76,7 +76,8 @@ def grid_of(bounds: np.ndarray, cell_size: float) -> Grid:
             f"cell_size {size:g} m makes a grid of {np.prod(counts):.3g} cells over this scene, at most {MOST_CELLS:,} "
             f"are supported; use {least * 1.01:.3g} m or more"
         )
-    return Grid(low - margin, size, tuple(int(n) for n in counts))
+    nx, ny, nz = (int(n) for n in counts)
+    return Grid(low - margin, size, (nx, ny, nz))
 
 
 def _cell_counts(extent: np.ndarray, size: float) -> np.ndarray:

@@ -14,7 +14,7 @@ from warp_gi.techniques.visibility_field import pictures
 from warp_gi.techniques.visibility_field.estimator import VisibilityField
 
 
-class VisibilityFieldTool(BakeTool):
+class VisibilityFieldTool(BakeTool[VisibilityField]):
     """Bakes the cells that a camera path sees, or all of them."""
 
     settings = VisibilityField
@@ -56,7 +56,7 @@ class VisibilityFieldTool(BakeTool):
         return pictures.write_pictures(scene, camera, bake, settings, folder, device, seed)
 
     def rows(self, bake: Bake, seconds: float) -> Rows:
-        """Return counts of cells, samples and rays, and how fast they were."""
+        """Return counts of cells, samples and rays, and rays a second."""
         counts = bake.counts
         return [
             ("cells", int(counts["cells"])),

@@ -17,6 +17,7 @@ from warp_gi.estimator import Ahead, Estimator
 from warp_gi.kernels import harmonics as harmonics_kernels
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_trace as trace_kernels
+from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.techniques.visibility_field.bake import field_query, grid_of
 from warp_gi.techniques.visibility_field.settings import MaskSettings
@@ -30,7 +31,6 @@ from warp_gi.techniques.visibility_field.state import (
 
 if TYPE_CHECKING:
     from warp_gi.frame import Frame
-    from warp_gi.scene.baked import BakedScene
     from warp_gi.scene.scene import Scene
 
 _MODES = {
@@ -44,8 +44,11 @@ COSINE_SETS = 32
 """Sets of cosine-weighted directions in a frame; each is turned about the normal at random, so few sets will do, and
 few stay in the processor's first cache."""
 MOST_SET_SIZE = 4096
+"""Largest number of directions in a set."""
 MOST_SET_SAMPLES = 1 << 16
+"""Largest number of sky samples in all sets of a frame, unless there are only 16 sets."""
 MOST_RESOLUTION = 512
+"""Largest number of texels along a side of a cell's masks."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +133,7 @@ class VisibilityField(Estimator):
 
     def bake_key(self, scene: Scene | BakedScene) -> str:
         """Return the hash of the geometry: nothing else decides visibility."""
-        return scene.geometry_hash
+        return whole_scene(scene).geometry_hash
 
     def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Any]:
         """Return the settings that decide the masks, with the cell size in metres."""
@@ -155,7 +158,7 @@ class VisibilityField(Estimator):
 
     def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> FieldState:
         """Return the state of a field with the masks of a bake."""
-        target = launch.get_device(device)
+        scene, target = whole_scene(scene), launch.get_device(device)
         if bake is None:
             return FieldState(scene, target, self.mask_settings, seed)
         return FieldState.from_bake(scene, target, self.mask_settings, seed, bake)
@@ -172,16 +175,16 @@ class VisibilityField(Estimator):
         return self.uses_cells and self.lazy and self.budget > 0
 
     def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
-        """Return whether a frame may find cells that those before it baked, or what pixels transferred then.
+        """Return whether a frame may use cells that earlier frames baked, or transfers that they kept.
 
         No cells are baked on the way if nothing moves and all cells that the frames ahead see are known.
         """
         if self.relight or not self._grows:
             return self.relight
-        return ahead is None or bool(scene.moving_objects) or ahead.state.lacks(ahead.views)
+        return ahead is None or bool(whole_scene(scene).moving_objects) or ahead.state.lacks(ahead.views)
 
     def preprocess(self, frame: Frame, state: FieldState) -> FieldState:
-        """Bake what came into view, within the budget; draw the frame's samples; look at the sky and at what moves."""
+        """Return the state for this frame: new cells within the budget, samples, the sky, and boxes of movers."""
         state = state.copied()
         state.query = self._query(frame)
         state.sky = self._sky(frame)
@@ -238,7 +241,7 @@ class VisibilityField(Estimator):
         return sky
 
     def trace(self, frame: Frame, state: FieldState) -> None:
-        """Add the light of the current camera sample, or of all of them when the pixels' transfers are known."""
+        """Add the light of the current camera sample; where transfers are known, the first one adds that of all."""
         if _is_black(frame.scene):
             return
         if self.relight and state.relights:
@@ -265,5 +268,5 @@ def _is_black(scene: Scene | BakedScene) -> bool:
 
 
 def _set_count(size: int) -> int:
-    """Return how many sets of samples a frame draws, a power of two."""
+    """Return how many sets of ``size`` sky samples a frame draws, a power of two."""
     return 1 << max(min(MOST_SET_SAMPLES // size, 256), 16).bit_length() - 1

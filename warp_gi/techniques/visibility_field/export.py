@@ -112,7 +112,7 @@ def export_textures(bake: Bake, path: str | Path) -> list[Path]:
         with replacing(path) as part:  # half floats hold 0 to 255 exactly
             planes = lambda y: pixels(y)[:, :, None].astype(np.float16)  # noqa: E731
             write_parts(part, path, planes, ("Y",), [_part_name(y) for y in range(ny)])
-    layers = {"files": [file.name for file in files]}
+    layers: dict[str, object] = {"files": [file.name for file in files]}
     if not is_png:
         layers = {"file": path.name, "parts": [_part_name(y) for y in range(ny)], "channel": "Y"}
     low = [float(v) for v in bake.arrays["grid_low"]]

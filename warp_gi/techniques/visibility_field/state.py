@@ -103,12 +103,12 @@ class FieldState:
         """Cells that were baked since the last motion; without any unless ``is_still``."""
         self.empty = np.zeros(self.grid.cell_count, bool)
         """bool [cell]: cells in which baking the static layer found no surface."""
-        self.data: field_kernels.VisibilityGrid | None = None
-        """Grid of this frame as kernels read it; None before the first frame."""
-        self.query: field_kernels.FieldQuery | None = None
-        """Directions and boxes of movers of this frame as kernels read them; None before the first frame."""
-        self.sky: trace_kernels.FieldSky | None = None
-        """Sky of this frame as kernels read it; None before the first frame."""
+        self.data = grid_struct(self.grid, settings.resolution, None, None)
+        """Grid of this frame as kernels read it; without cells before the first frame."""
+        self.query = field_kernels.FieldQuery()
+        """Directions and boxes of movers of this frame as kernels read them; empty before the first frame."""
+        self.sky = trace_kernels.FieldSky()
+        """Sky of this frame as kernels read it; empty before the first frame."""
         self.transfer: wp.array | None = None
         """float32 [27 * pixel]: what each harmonic of a white sky adds to a pixel, in the frame that ``transfer_key``
         belongs to; None unless the field relights."""
@@ -299,7 +299,7 @@ class FieldState:
             self._is_stale = True
         self.is_still = not moved
         self.poses = poses
-        if self.query is not None and self.movers:
+        if self.movers:
             boxes = [self.scene.node_box(node, now) for node in self.movers.values()]
             margin = 1e-4 * self.scene.radius
             corners = np.concatenate([np.stack([low - margin, high + margin]) for low, high in boxes])
@@ -318,8 +318,8 @@ class FieldState:
             new = np.arange(len(masks), len(masks) + len(settled.cells), dtype=np.int32)
             slots[settled.cells] = new | settled.flags
             masks = np.concatenate([masks, settled.masks])
-        slots_array = wp.array(slots, dtype=wp.int32, device=self.device)
-        masks_array = wp.array(masks.reshape(-1), dtype=wp.uint32, device=self.device)
+        slots_array: wp.array = wp.array(slots, dtype=wp.int32, device=self.device)
+        masks_array: wp.array = wp.array(masks.reshape(-1), dtype=wp.uint32, device=self.device)
         self.data = grid_struct(self.grid, self.settings.resolution, slots_array, masks_array)
         self._is_stale = False
 
