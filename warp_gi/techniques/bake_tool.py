@@ -26,7 +26,7 @@ class Table(NamedTuple):
     """Heading of the table."""
     columns: tuple[str, ...]
     """Names of the columns."""
-    rows: list[tuple[Value, ...]]
+    rows: Sequence[tuple[Value, ...]]
     """Rows, each with a value for every column."""
 
 

@@ -58,7 +58,9 @@ def march_rays(
     hits = march_kernels.MarchHits()
     for name, variable in march_kernels.MarchHits.vars.items():
         setattr(hits, name, wp.empty(count, dtype=variable.type.dtype, device=device))
-    rays: list[wp.array] = [wp.array(np.float32(v), dtype=wp.vec3, device=device) for v in (origins, directions)]
+    rays: list[wp.array] = [
+        wp.array(np.asarray(v, np.float32), dtype=wp.vec3, device=device) for v in (origins, directions)
+    ]
     inputs = [state.field, *rays, float("inf"), most_steps, hits]
     launch.launch(march_kernels.march_rays, count, inputs, device)
     return {name: getattr(hits, name).numpy() for name in march_kernels.MarchHits.vars}
