@@ -27,11 +27,11 @@ from warp_gi.techniques.light_field.places import (
     ProbeGrid,
     lit_bounds,
     lit_data,
-    map_resolution,
     place_grid,
     probe_grid,
     relocate,
 )
+from warp_gi.techniques.light_field.settings import map_resolution
 from warp_gi.techniques.light_field.state import ProbeState, low_directions
 
 wp.set_module_options({"enable_backward": False})
