@@ -14,7 +14,7 @@ from warp_gi import launch
 from warp_gi.alias import AliasTable
 from warp_gi.kernels import gbuffer, path_trace, types
 from warp_gi.kernels.path_trace import TERM_EMITTERS, TERM_ENVIRONMENT, TERM_INDIRECT
-from warp_gi.scheduler import camera_data
+from warp_gi.scene.pinhole import camera_data
 from warp_gi.techniques.paths.estimators import sky_probability
 
 EVERYTHING = TERM_ENVIRONMENT | TERM_EMITTERS | TERM_INDIRECT

@@ -13,6 +13,7 @@ from warp_gi.estimator import Ahead, Estimator
 from warp_gi.kernels import light_hierarchy
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.techniques.light_hierarchy import tree as light_tree
+from warp_gi.techniques.light_hierarchy.bounds import EmitterBounds, emitter_bounds
 
 if TYPE_CHECKING:
     from warp_gi.baking import Bake
@@ -64,7 +65,7 @@ class TreeState:
 
     tree: light_tree.TreeArrays
     """Tree on the host."""
-    bounds: light_tree.EmitterBounds
+    bounds: EmitterBounds
     """Bounds of the emitters that the tree's boxes and cones are around."""
     data: light_hierarchy.LightTree
     """Tree as kernels read it."""
@@ -77,7 +78,7 @@ def first_tree(scene: Scene | BakedScene, device: wp.Device) -> TreeState | None
     """
     if scene.emitter_count == 0:
         return None
-    bounds = light_tree.emitter_bounds(whole_scene(scene), device)
+    bounds = emitter_bounds(whole_scene(scene), device)
     tree = light_tree.build_tree(bounds)
     return TreeState(tree, bounds, light_tree.to_device(tree, device))
 
@@ -85,12 +86,12 @@ def first_tree(scene: Scene | BakedScene, device: wp.Device) -> TreeState | None
 def moved_tree(frame: Frame, state: TreeState) -> TreeState:
     """Return the tree with its boxes and cones around the lights of a frame."""
     if frame.scene.is_animated:
-        bounds = light_tree.emitter_bounds(whole_scene(frame.scene), frame.device)
+        bounds = emitter_bounds(whole_scene(frame.scene), frame.device)
         if not _same(bounds, state.bounds):
             tree = light_tree.refit_tree(state.tree, bounds)
             return TreeState(tree, bounds, light_tree.to_device(tree, frame.device))
     return state
 
 
-def _same(a: light_tree.EmitterBounds, b: light_tree.EmitterBounds) -> bool:
+def _same(a: EmitterBounds, b: EmitterBounds) -> bool:
     return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("low", "high", "axis"))
