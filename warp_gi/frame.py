@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -97,7 +97,7 @@ class Frame:
         width, height = camera.resolution
         count = width * height
 
-        def zeros(dtype: Any) -> wp.array:
+        def zeros(dtype: type) -> wp.array:
             return wp.zeros(count, dtype=dtype, device=device)
 
         self._arrays: dict[str, wp.array] = {name: zeros(wp.vec3) for name in _VEC3_BUFFERS}
@@ -137,10 +137,10 @@ class Frame:
         width, height = self.camera.resolution
         return values.reshape(height, width, *values.shape[1:])
 
-    def struct(self, struct: Any) -> Any:
+    def struct(self, struct: type[launch.Struct]) -> launch.Struct:
         """Return a kernel struct whose fields are the buffers of the same names."""
         filled = struct()
-        for name in struct.vars:
+        for name in launch.fields_of(struct):
             setattr(filled, name, self._arrays.get(name))
         return filled
 
@@ -202,7 +202,7 @@ class Frame:
 
     # ---- launches ----
 
-    def launch(self, kernel: wp.Kernel, inputs: list[Any], count: int | None = None) -> None:
+    def launch(self, kernel: wp.Kernel, inputs: Sequence[object], count: int | None = None) -> None:
         """Run a kernel over ``count`` items, or over every pixel."""
         width, height = self.camera.resolution
         launch.launch(kernel, width * height if count is None else count, inputs, self.device)
@@ -213,7 +213,7 @@ class Frame:
         tiles = [math.ceil(size / gbuffer.TILE) for size in self.camera.resolution]
         return tiles[0] * tiles[1] * gbuffer.TILE**2
 
-    def launch_tiled(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
+    def launch_tiled(self, kernel: wp.Kernel, inputs: Sequence[object]) -> None:
         """Run a kernel over every pixel in tiles (``kernels.gbuffer.tiled_pixel``)."""
         self.launch(kernel, inputs, self.tiled_items)
 

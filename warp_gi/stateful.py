@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from warp_gi.baking import Bake
+    from warp_gi.baking import Bake, Setting
     from warp_gi.frame import Frame
     from warp_gi.scene.baked import BakedScene
     from warp_gi.scene.camera import Camera, CameraPath
@@ -51,7 +51,7 @@ class Stateful:
         """
         return ""
 
-    def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Any]:
+    def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Setting]:
         """Return the settings that a bake depends on."""
         return {}
 
