@@ -232,7 +232,7 @@ class Oidn(Denoiser):
 
 
 DENOISERS: dict[str, type[Denoiser]] = {"oidn": Oidn, "spatiotemporal": SpatioTemporal}
-"""What a pipeline's ``denoise`` may name."""
+"""Classes that a pipeline's ``denoise`` may name."""
 
 
 def denoiser_named(name: str) -> Denoiser:

@@ -49,9 +49,9 @@ class FrameSettings:
     """Settings of a pipeline that decide how a frame is sampled."""
 
     spp: int
-    """Samples a pixel."""
+    """Number of samples a pixel."""
     camera_samples: int
-    """Camera rays a pixel that the samples are spread over."""
+    """Number of camera rays a pixel that the samples are spread over."""
     filter: str = "box"
     """Pixel filter, "box" or "tent"."""
     wants_lobes: bool = False
@@ -82,15 +82,15 @@ class Frame:
         self.camera, self.previous_camera = camera, previous_camera
         self.index, self.previous_index = index, previous_index
         self.time = frame_time
-        """Seconds from the first frame."""
+        """Time of the frame in seconds from the first one."""
         self.seed = seed
         """Hash of the sequence's seed and the frame's number."""
         self.timings: dict[str, float] = {}
         """Wall seconds by stage; "compile" is kernel compilation, left out of the others."""
         self.metadata: dict[str, str | int | float] = {}
-        """What decides the pixels beside camera and time, by name."""
+        """Values by name that decide the pixels, beside camera and time."""
         self.paths = PathRequest()
-        """What estimators ask of the path tracer."""
+        """Requests of estimators to the path tracer."""
         self.sky_probability = sky_probability(scene)
         """Probability of sampling the sky where a path vertex samples either the sky or an emitter."""
         self._offers: dict[type, Any] = {}

@@ -36,9 +36,10 @@ CUDA_BLOCK = 256  # threads
 _loading = threading.RLock()  # taken across a fork, so that no thread that only the parent has is inside the compiler
 _threads: int | None = None
 compile_seconds = 0.0
-"""Wall seconds this process has spent compiling or loading kernel modules."""
+"""Wall seconds that this process has spent compiling or loading kernel modules."""
 compile_cpu_seconds = 0.0
-"""CPU seconds of the same; fewer where other processes wanted the cores."""
+"""CPU seconds that this process has spent compiling or loading kernel modules; fewer than wall seconds where other
+processes wanted the cores."""
 on_load: Callable[[str], None] | None = None
 """Called with a kernel module's name before its first launch, which may take seconds to compile; for progress."""
 _loaded: set[tuple[str, str]] = set()

@@ -27,7 +27,7 @@ class Image(Protocol):
 
 RELATIVE_EPSILON = 1e-2
 PIXELS_PER_DEGREE = 67.02064
-"""FLIP's default viewer: 0.7 m from a 0.7 m wide 3840-pixel screen."""
+"""Pixels a degree of FLIP's default viewer: 0.7 m from a 0.7 m wide screen of 3840 pixels."""
 
 
 def rmse(image: Image, reference: Image) -> float:

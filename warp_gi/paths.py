@@ -49,7 +49,7 @@ class PathRequest:
         self.regions = SamplerInUse(path_samplers.NO_REGIONS, path_samplers.NoRegions())
         """Regions of space that samplers tell apart. Set by ``prepare``, if a sampler uses regions."""
         self.sky = SamplerInUse(path_samplers.SCENE_SKY, path_samplers.SceneSky())
-        """What paths meet where they leave the scene."""
+        """Sky that paths meet where they leave the scene."""
         self.cache = SamplerInUse(path_samplers.NO_CACHE, path_samplers.NoCache())
         """Radiance cache that paths may end in."""
         self.cache_vertex = int(path_trace.CACHE_VERTEX)

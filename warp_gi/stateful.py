@@ -19,7 +19,7 @@ class Ahead:
     """What is known of a sequence before its first frame."""
 
     state: Any
-    """State before the first frame of whom the question is asked."""
+    """State before the first frame, of the part that the question is about."""
     views: Sequence[tuple[int, Camera]]
     """Number and camera of each frame that will be rendered."""
     sky_changes: bool = False

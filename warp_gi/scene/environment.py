@@ -94,15 +94,15 @@ class Environment:
     """A sky: a latitude-longitude map, a constant colour, or (neither given) black."""
 
     pixels: np.ndarray | None = None
-    """float32 [height, width, 3] radiance in W/(m^2 sr), width = 2 height, row 0 up."""
+    """Radiance map in W/(m^2 sr), float32 [height, width, 3] with width = 2 height, row 0 at the zenith."""
     color: Color | None = None
-    """Constant radiance in W/(m^2 sr)."""
+    """Constant radiance in W/(m^2 sr), RGB; in place of a map."""
     rotation: float = 0.0
-    """Degrees about +y; positive turns the sky counter-clockwise seen from above."""
+    """Angle in degrees about +y; a positive one turns the sky counter-clockwise seen from above."""
     scale: float = 1.0
-    """Multiplies the radiance."""
+    """Factor on the radiance."""
     name: str = "environment"
-    """What error messages call it."""
+    """Name in error messages."""
     _map: SkyMap | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:

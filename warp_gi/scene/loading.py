@@ -19,7 +19,7 @@ from warp_gi.scene.scene import Scene
 EXTENSIONS = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
 
 DAMAGE = (ArithmeticError, AttributeError, EOFError, LookupError, NameError, OSError, TypeError, ValueError)
-"""What readers, trimesh's among them, raise on damaged files."""
+"""Exceptions that readers, trimesh's among them, raise on damaged files."""
 
 
 def load_scene(

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from warp_gi.scene.pinhole import Camera
 
 POSES_FOR_BOUNDS = 33
-"""Evenly spaced poses, beside those of the keyframes, that the bounds of an animated scene enclose."""
+"""Number of evenly spaced poses, beside those of the keyframes, that the bounds of an animated scene enclose."""
 
 
 class Scene:
@@ -61,7 +61,8 @@ class Scene:
         self._guard = Guard()
         self.name = name
         self.version = 0
-        """Counts up when the environment or the animation becomes another: what was derived from the scene is stale."""
+        """Number of changes of environment and animation so far. After another one, what was derived from the
+        scene is stale."""
         self.nodes: list[Node] = [replace(node) for node in nodes]
         self.lights: list[PunctualLight] = list(lights)
         self.cameras: dict[str, Camera] = dict(cameras or {})
@@ -74,7 +75,7 @@ class Scene:
         self._environment: Environment | None = None
         self._sky_at: Callable[[float], Sky] | None = None
         self._sky_time: float | None = 0.0
-        """Time that the sky is of, if it is a function of time; None while it changes."""
+        """Time in seconds of the present sky, if it is a function of time; None while it changes."""
         self._sky_shown: tuple[object, ...] | None = None
         self.environment = environment
 

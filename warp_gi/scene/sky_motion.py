@@ -24,7 +24,7 @@ class TurningSky:
     sky: Sky
     """The sky at time 0: a path to a map, an RGB radiance, an Environment or a SunSky."""
     degrees: float
-    """Angle in degrees by which it turns in ``1 / fps`` seconds; positive is counter-clockwise seen from above."""
+    """Angle in degrees by which the sky turns in ``1 / fps`` seconds; positive is counter-clockwise seen from above."""
     fps: float = 1.0
     """Steps per second. With 1, ``degrees`` is the angle per second; with a camera path's fps, the angle per frame."""
 
