@@ -22,6 +22,9 @@ from warp_gi import __version__
 from warp_gi.errors import BakeError
 from warp_gi.files import replacing
 
+Setting = str | int | float
+"""Value of a setting in a bake; bool is an int."""
+
 FORMAT = "warp_gi bake"
 FORMAT_VERSION = 1
 MOST_HEADER = 100_000_000  # bytes; safetensors reads no longer one
@@ -44,17 +47,17 @@ class Bake:
     """What an estimator computed before the first frame, and what it is valid for."""
 
     technique: str
-    """The estimator's name."""
+    """Class name of the estimator."""
     scene_key: str
     """Hash of just what the bake depends on; for visibility ``Scene.geometry_hash``."""
-    settings: dict[str, Any]
-    """Those the bake depends on: str, int, float or bool."""
+    settings: dict[str, Setting]
+    """Settings of the estimator that the bake depends on: str, int, float or bool, by name."""
     arrays: dict[str, np.ndarray]
-    """bool, u/int8 to 64 or float16 to 64, of any shape."""
+    """Arrays by name: bool, int8 to int64, uint8 to uint64 or float16 to float64, of any shape."""
     counts: dict[str, int | float] = field(default_factory=dict)
-    """What was done: samples, rays, cells, seconds."""
+    """Numbers that say what was done, by name: samples, rays, cells, seconds."""
     scene_name: str = ""
-    """For messages only."""
+    """Name of the scene, for messages only."""
 
     @property
     def nbytes(self) -> int:
@@ -103,11 +106,11 @@ class Bake:
         """Read a bake; see ``load_bake``."""
         return load_bake(path)
 
-    def has(self, settings: Mapping[str, Any]) -> bool:
+    def has(self, settings: Mapping[str, Setting]) -> bool:
         """Return whether the bake was made with these settings."""
         return self.settings == dict(settings)
 
-    def check(self, technique: str, scene_key: str, settings: Mapping[str, Any], scene_name: str = "") -> None:
+    def check(self, technique: str, scene_key: str, settings: Mapping[str, Setting], scene_name: str = "") -> None:
         """Raise BakeError saying why, unless the bake is by ``technique``, of this scene and with these settings."""
         if technique != self.technique:
             raise BakeError(
@@ -243,9 +246,9 @@ def _stored(name: str, array: np.ndarray) -> np.ndarray:
     return np.asarray(array, array.dtype.newbyteorder("<"), order="C")
 
 
-def _bytes(array: np.ndarray) -> np.ndarray:
-    """Return a view of a contiguous array's bytes, uint8 [nbytes]."""
-    return array.reshape(-1).view(np.uint8)
+def _bytes(array: np.ndarray) -> memoryview:
+    """Return a view of a contiguous array's bytes."""
+    return array.reshape(-1).view(np.uint8).data
 
 
 def _digest(arrays: Mapping[str, np.ndarray]) -> str:
@@ -292,7 +295,7 @@ def _scene(name: str, key: str) -> str:
     return f"{repr(name) if name else 'an unnamed scene'} (geometry {key[:12]})"
 
 
-def _shown(settings: Mapping[str, Any], name: str) -> str:
+def _shown(settings: Mapping[str, Setting], name: str) -> str:
     if name not in settings:
         return "none"
     return repr(settings[name]) if isinstance(settings[name], str) else str(settings[name])

@@ -6,6 +6,7 @@ import contextlib
 import mmap
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -29,15 +30,15 @@ class AlphaMasks:
     """Holes cut by textures: a hit where bilinear alpha times factor is below the cutoff is passed through."""
 
     face_mask: np.ndarray
-    """int32 [triangle]: index in ``masks``, -1 is opaque."""
+    """Index in ``masks`` of each triangle's mask, int32 [triangle]; -1 is opaque."""
     masks: Sequence[tuple[int, float, float]]
-    """(index in ``textures`` or -1 for alpha 1, alpha factor, cutoff)."""
+    """Masks as (index in ``textures``, or -1 for alpha 1; factor on alpha; cutoff)."""
     uvs: np.ndarray
-    """float32 [vertex, 2], v up."""
+    """Texture coordinates, float32 [vertex, 2], v up."""
     textures: wp.array
-    """dtype kernels.types.Texture, on the tree's device."""
+    """Textures that masks look up, kernels.types.Texture [texture], on the tree's device."""
     texels: wp.array
-    """uint32 RGBA8, red in the low byte, on the tree's device."""
+    """Texels of all textures, uint32 RGBA8 [texel] with red in the low byte, on the tree's device."""
 
 
 @dataclass(eq=False)
@@ -45,13 +46,13 @@ class Hits:
     """Closest hits, one for each ray. The point is (1 - u - v) p0 + u p1 + v p2 in index-buffer order."""
 
     t: wp.array
-    """float32 [ray], in units of the direction's length; t_max on a miss."""
+    """Distance along the ray, float32 [ray], in units of the direction's length; t_max on a miss."""
     face: wp.array
-    """int32 [ray], -1 on a miss."""
+    """Index of the triangle that was hit, int32 [ray]; -1 on a miss."""
     u: wp.array
-    """float32 [ray]"""
+    """Barycentric weight of the triangle's second vertex, float32 [ray]."""
     v: wp.array
-    """float32 [ray]"""
+    """Barycentric weight of the triangle's third vertex, float32 [ray]."""
 
 
 class TriangleBvh:
@@ -80,8 +81,8 @@ class TriangleBvh:
         self.triangle_count = len(corners)
         self.vertex_count = len(positions)
         self.data = types.Bvh()
-        self._positions = wp.array(positions, dtype=wp.vec3, device=self.device)
-        self._indices = wp.array(corners.astype(np.int32), dtype=wp.vec3i, device=self.device)
+        self._positions: wp.array = wp.array(positions, dtype=wp.vec3, device=self.device)
+        self._indices: wp.array = wp.array(corners.astype(np.int32), dtype=wp.vec3i, device=self.device)
         self._alpha = alpha
         if alpha is not None:
             self._set_alpha(alpha)
@@ -138,7 +139,7 @@ class TriangleBvh:
         count = len(rays.origins)
         if count != len(rays.directions):
             raise SceneError(f"expected as many ray directions as origins ({count}), got {len(rays.directions)}")
-        limits = t_max if isinstance(t_max, wp.array) else np.atleast_1d(_as_numpy(t_max)).astype(np.float32)
+        limits: Any = t_max if isinstance(t_max, wp.array) else np.atleast_1d(_as_numpy(t_max)).astype(np.float32)
         if limits.ndim != 1 or len(limits) not in (1, count):
             raise SceneError(f"t_max must be a number or one for each of {count} rays, got shape {limits.shape}")
         rays.t_max = wp.array(limits, dtype=wp.float32, device=self.device, copy=False)
@@ -227,10 +228,11 @@ def _block_parents(nodes: wp.array, block_count: int) -> np.ndarray:
 def _make_mesh(points: wp.array, corners: np.ndarray, positions: np.ndarray) -> wp.Mesh:
     """Return the wp.Mesh of the CUDA path, its zero-area triangles shrunk to a point, which no ray hits."""
     a, b, c = (positions[corners[:, k]].astype(np.float64) for k in range(3))
-    flat = ~np.cross(b - a, c - a).any(axis=1)
+    flat = np.logical_not(np.cross(b - a, c - a).any(axis=1))
     corners = np.where(flat[:, None], corners[:, :1], corners)
-    indices = wp.array(np.ascontiguousarray(corners, dtype=np.int32).ravel(), dtype=wp.int32, device=points.device)
-    if points.device.is_cpu:
+    device = wp.get_device(points.device)
+    indices: wp.array = wp.array(np.ascontiguousarray(corners, dtype=np.int32).ravel(), dtype=wp.int32, device=device)
+    if device.is_cpu:
         return wp.Mesh(points, indices, bvh_constructor="sah", bvh_leaf_size=4)
     return wp.Mesh(points, indices)
 
@@ -255,7 +257,8 @@ def _as_numpy(value: object) -> np.ndarray:
     if isinstance(value, wp.array):
         return value.numpy()
     if hasattr(value, "__dlpack__"):
-        return wp.from_dlpack(value).numpy()
+        shared: Any = wp.from_dlpack(value)
+        return shared.numpy()
     return np.asarray(value)
 
 

@@ -38,5 +38,5 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> OptionError:
 
 def check_whole(name: str, value: object, least: int, most: int) -> None:
     """Raise OptionError unless a setting is a whole number in a range."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or not least <= value <= most:
+    if isinstance(value, bool) or not isinstance(value, Integral) or not least <= int(value) <= most:
         raise OptionError(f"{name} must be a whole number from {least} to {most}, got {value!r}")

@@ -30,7 +30,7 @@ class Guard:
 
 def _after_fork() -> None:
     global has_lost_cuda
-    context = sys.modules.get("warp._src.context")
+    context: Any = sys.modules.get("warp._src.context")
     if getattr(context, "runtime", None) is not None:  # asked without a call, which would start Warp
         has_lost_cuda = context.is_cuda_available()
     for guard in list(_guards):

@@ -13,13 +13,13 @@ import numpy as np
 
 import warp_gi
 from warp_gi import launch
-from warp_gi.baking import Bake, load_bake
+from warp_gi.baking import Bake, Setting, load_bake
 from warp_gi.denoise import Denoiser
 from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.frame import Frame
 from warp_gi.kernels import compose, types
 from warp_gi.pipeline import DENOISER, Pipeline
-from warp_gi.scene.baked import BakedScene
+from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.camera import Camera, CameraPath, frame_time
 from warp_gi.scene.scene import Scene
 from warp_gi.sequence.state import Dependence, state_arrays, with_arrays
@@ -35,7 +35,7 @@ def _holds_scene(
     """Return a method during which no other thread moves, edits or renders the scene."""
 
     @wraps(method)
-    def holding(self: FrameScheduler, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+    def holding(self: FrameScheduler, /, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
         with self.scene.lock:
             return method(self, *args, **kwargs)
 
@@ -132,7 +132,7 @@ class FrameScheduler:
         if bake is None and place != DENOISER:
             self._progress(f"bake {place}", 0.0)
             told = lambda share: self._progress(f"bake {place}", share)  # noqa: E731
-            bake = part.bake(self.scene, device, self.seed, told, self.camera)
+            bake = part.bake(whole_scene(self.scene), device, self.seed, told, self.camera)
         elif bake is not None and not isinstance(self.scene, BakedScene):
             settings = part.bake_settings(self.scene)
             bake.check(type(part).__name__, part.bake_key(self.scene), settings, self.scene.name)
@@ -291,8 +291,8 @@ class FrameScheduler:
 
     def _saved_state(self, lineage: str, arrays: dict[str, np.ndarray]) -> Bake:
         """Return a file's contents; the sky may differ from that of the frame before."""
-        settings = {key: str(value) for key, value in self.metadata().items() if key != "scene_hash"}
-        settings |= {"lineage": lineage}
+        settings: dict[str, Setting] = {"lineage": lineage}
+        settings |= {key: str(value) for key, value in self.metadata().items() if key != "scene_hash"}
         return Bake("FrameScheduler", self.scene.contents_hash, settings, arrays, scene_name=self.scene.name)
 
 

@@ -106,7 +106,7 @@ def _write(options: CompareBench, rows: list[records.Row], found: compare.Compar
 
 def _pictures(found: compare.Comparison, limit: float) -> list[PictureSet]:
     reference = found.reference.picture.astype(np.float32)
-    first = {run.name: run.first.astype(np.float32) for run in found.runs}
+    first = {run.name: run.first.astype(np.float32) for run in found.runs if run.first is not None}
     means = {run.name: run.mean.astype(np.float32) for run in found.runs}
     return [
         PictureSet(f"mean of the frames within {limit:g} s", reference, means, NAME),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -37,7 +37,7 @@ def main(arguments: Sequence[str]) -> int:
     )
     textures = distinct_textures(scene.materials)
     if textures:
-        rows = [
+        rows: list[tuple[object, ...]] = [
             (t.name, f"{t.pixels.shape[1]}x{t.pixels.shape[0]}", "sRGB" if t.srgb else "linear", *t.wrap)
             for t in textures
         ]
@@ -91,5 +91,6 @@ def _material_row(material: Material) -> tuple[object, ...]:
     return material.name, _numbers(material.base_color), material.metallic, material.roughness, emission, alpha, used
 
 
-def _numbers(values: Sequence[float]) -> str:
+def _numbers(values: Iterable[float]) -> str:
+    """Return numbers with three digits each, spaces between."""
     return " ".join(f"{float(v) + 0.0:.3g}" for v in values)

@@ -13,6 +13,7 @@ import tyro
 
 from warp_gi.cli.options import flag
 from warp_gi.errors import OptionError, unknown_name
+from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.builtin import BUILTIN_SCENES, builtin_camera_path, builtin_scene
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.environment import Environment, SunSky, as_environment
@@ -33,24 +34,24 @@ class SceneOptions:
     scene: Annotated[str, tyro.conf.Positional, flag("[SCENE]", DEFAULT_SCENE)] = ""
     """A GLB, glTF, OBJ or PLY file, or the name of a built-in scene."""
     smooth: Annotated[float | None, flag("DEGREES", "flat, as glTF asks")] = None
-    """Smooth normals for meshes of a file that have none, except across edges that bend more than this."""
+    """Crease angle in degrees: meshes of a file without normals get smooth ones, except across edges that bend more."""
     scale: float = 1.0
-    """Metres in one unit of the file."""
+    """Length in metres of one unit of the file."""
     environment: Annotated[str, flag("SKY", "the scene's own; files: none")] = ""
-    """The sky: a latitude-longitude EXR or HDR file, a radiance R,G,B, sun-sky, or none."""
+    """Sky of the scene: a latitude-longitude EXR or HDR file, a radiance R,G,B, sun-sky, or none."""
     environment_rotation: float = 0.0
-    """Turns the sky about +y, degrees, counter-clockwise seen from above."""
+    """Angle in degrees by which the sky is turned about +y, counter-clockwise seen from above."""
     environment_scale: float = 1.0
-    """Multiplies the sky's radiance."""
+    """Factor on the sky's radiance."""
     sun: SunSky = field(default_factory=SunSky)
     camera: Annotated[str, flag("PATH", "the built-in path, the file's first camera, or one that sees all")] = ""
-    """A camera path in JSON, the name of a camera in the scene, or of a built-in scene whose path to take."""
+    """Camera path in JSON, name of a camera in the scene, or name of a built-in scene whose path to take."""
     eye: Annotated[tuple[float, float, float] | None, flag("X Y Z", "use --camera")] = None
-    """Where a still camera stands, metres."""
+    """Position of a still camera in metres."""
     target: Annotated[tuple[float, float, float] | None, flag("X Y Z", "use --camera")] = None
-    """What it looks at."""
+    """Point in metres that a still camera looks at."""
     hfov: Annotated[float | None, flag("DEGREES", "the camera's own; 65 with --eye")] = None
-    """Horizontal field of view of a still camera."""
+    """Horizontal field of view of a still camera in degrees."""
 
 
 def open_scene(name: str, smooth: float | None = None, scale: float = 1.0) -> Scene:
@@ -94,19 +95,19 @@ def parse_environment(options: SceneOptions) -> Environment:
     return sky.rotated(options.environment_rotation)
 
 
-def find_camera(options: SceneOptions, scene: Scene, report: Reporter) -> Camera | CameraPath:
+def find_camera(options: SceneOptions, scene: Scene | BakedScene, report: Reporter) -> Camera | CameraPath:
     """Return the camera or path that was asked for."""
-    if (options.eye is None) != (options.target is None):
-        raise OptionError("--eye and --target go together; give both")
     if options.hfov is not None and not 0.0 < options.hfov < 180.0:
         raise OptionError(f"--hfov must be between 0 and 180 degrees, got {options.hfov:g}")
-    if options.eye is not None:
+    if options.eye is not None or options.target is not None:
+        if options.eye is None or options.target is None:
+            raise OptionError("--eye and --target go together; give both")
         if options.camera:
             raise OptionError("--camera and --eye exclude each other; give one")
         return Camera.look_at(options.eye, options.target, hfov=options.hfov or 65.0)
     camera: Camera | CameraPath
     if options.camera in scene.cameras:
-        camera = scene_camera(scene, options.camera)
+        camera = scene_camera(whole_scene(scene), options.camera)
     elif options.camera.lower().endswith(".json"):
         camera = CameraPath.load(options.camera)
     elif options.camera in BUILTIN_SCENES:
@@ -115,9 +116,9 @@ def find_camera(options: SceneOptions, scene: Scene, report: Reporter) -> Camera
         raise unknown_name("camera", options.camera, [*scene.cameras, *BUILTIN_SCENES, "a .json file"])
     elif (options.scene or DEFAULT_SCENE) in BUILTIN_SCENES:
         camera = builtin_camera_path(options.scene or DEFAULT_SCENE)
-    elif scene.name in BUILTIN_SCENES and not scene.triangle_count:  # a bake of it
+    elif scene.name in BUILTIN_SCENES and isinstance(scene, BakedScene):
         camera = builtin_camera_path(scene.name)
-    elif not scene.triangle_count:
+    elif isinstance(scene, BakedScene):
         raise OptionError("a bake has no camera; give --camera or --eye and --target, inside of the scene")
     elif scene.cameras:
         camera = scene_camera(scene, next(iter(scene.cameras)))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from typing import Any
 
 from warp_gi import registry
+from warp_gi.denoise import Denoiser, denoiser_named
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.frame import TERMS
 from warp_gi.pipeline import Pipeline, estimator_named
@@ -23,14 +25,15 @@ def pipeline_named(text: str) -> Pipeline:
         place, _, value = (part.strip() for part in change.partition("="))
         term, _, inner = place.partition(".")
         if place == "denoise":
-            pipeline = replace(pipeline, denoise=denoiser_named(value))
+            pipeline = replace(pipeline, denoise=find_denoiser(value))
         elif term not in TERMS or inner not in ("", "ends_in"):
             raise unknown_name("term of a pipeline", place, (*TERMS, *(f"{one}.ends_in" for one in TERMS), "denoise"))
         elif inner:
             pipeline = _ending(pipeline, term, value)
         else:
             estimator = None if value.lower() == "none" else estimator_named(term, value)
-            pipeline = replace(pipeline, **{term: estimator})
+            changed: dict[str, Any] = {term: estimator}
+            pipeline = replace(pipeline, **changed)
     return pipeline
 
 
@@ -52,6 +55,6 @@ def _cache_named(name: str) -> RadianceCache:
     return caches[name]()
 
 
-def denoiser_named(name: str) -> str | None:
-    """Return what a pipeline takes for "none", "oidn", "SpatioTemporal"."""
-    return None if name.lower() == "none" else name.lower()
+def find_denoiser(name: str) -> Denoiser | None:
+    """Return the denoiser of a name as "none", "oidn" or "SpatioTemporal"; raises OptionError for an unknown one."""
+    return None if name.lower() == "none" else denoiser_named(name.lower())

@@ -6,14 +6,15 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warp_gi.errors import SceneError
 from warp_gi.scene.model import Keyframe, Node
 
 
-def pose_matrix(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray) -> np.ndarray:
+def pose_matrix(translation: ArrayLike, rotation: ArrayLike, scale: ArrayLike) -> np.ndarray:
     """Return float64 [4, 4]: scale first, then the rotation (quaternion x, y, z, w), then the translation."""
-    x, y, z, w = np.asarray(rotation, np.float64) / np.linalg.norm(rotation)
+    x, y, z, w = np.asarray(rotation, np.float64) / np.linalg.norm(np.asarray(rotation))
     matrix = np.eye(4)
     matrix[:3, :3] = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -25,10 +26,9 @@ def pose_matrix(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray
     return matrix
 
 
-def slerp(a: np.ndarray, b: np.ndarray, weight: float) -> np.ndarray:
-    """Return the unit quaternion (x, y, z, w) ``weight`` of the shorter way from ``a`` to ``b``."""
-    a = np.asarray(a, np.float64) / np.linalg.norm(a)
-    b = np.asarray(b, np.float64) / np.linalg.norm(b)
+def slerp(start: ArrayLike, end: ArrayLike, weight: float) -> np.ndarray:
+    """Return the unit quaternion (x, y, z, w) ``weight`` of the shorter way from ``start`` to ``end``."""
+    a, b = (np.asarray(one, np.float64) / np.linalg.norm(np.asarray(one)) for one in (start, end))
     cosine = float(a @ b)
     if cosine < 0.0:
         b, cosine = -b, -cosine

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -21,16 +21,19 @@ class SceneContents(Protocol):
     nodes: list[Node]
     lights: list[PunctualLight]
     materials: list[Material]
-    _devices: Mapping[str, Any]
-    """Buffers by device (``DeviceScene``)."""
     _flat: FlatGeometry
-    """Copy of the geometry of all nodes, at time 0."""
+    """Copy of the geometry of all nodes at time 0, in world space."""
     _emissive: np.ndarray
-    """Indices of the triangles that emit."""
-    _moving: Sequence[bool]
-    """Whether each node moves."""
-    _world: Sequence[np.ndarray]
+    """Indices of the triangles that emit, int64 [emissive triangle]."""
+    _moving: list[bool]
+    """Whether each node moves, by its index."""
+    _world: list[np.ndarray]
     """Placement of each node at time 0, float64 [4, 4]."""
+
+    @property
+    def _devices(self) -> Mapping[str, Any]:
+        """Buffers on each device (``DeviceScene``), by the device's alias."""
+        ...
 
     @property
     def environment(self) -> Environment | None:
@@ -55,6 +58,10 @@ class SceneContents(Protocol):
     @property
     def radius(self) -> float:
         """Half the diagonal of the bounds, metres."""
+        ...
+
+    def emitter_powers(self) -> np.ndarray:
+        """Return the power of each emitter [W, as luminance], float64 [emitter_count]."""
         ...
 
     @property

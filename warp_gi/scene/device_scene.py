@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -16,6 +16,7 @@ from warp_gi.launch import on_device
 from warp_gi.scene import animation, emitters, geometry, textures
 
 if TYPE_CHECKING:
+    from warp_gi.bvh import AlphaMasks, TriangleBvh
     from warp_gi.scene.contents import SceneContents
     from warp_gi.scene.environment import Environment
 
@@ -67,7 +68,8 @@ class DeviceScene:
         data.radius = scene.radius
         masks = alpha_masks(flat, scene.materials, images, data.textures, data.texels)
         self.bvh = TriangleBvh(flat.points, flat.indices, device=device.alias, alpha=masks)
-        self._masks, self._resting_bvh = masks, None
+        self._masks: AlphaMasks | None = masks
+        self._resting_bvh: TriangleBvh | None = None
         self._light_table: wp.array | None = None
         data.bvh = self.bvh.data
         self.data = data
@@ -78,7 +80,7 @@ class DeviceScene:
             self._light_table = AliasTable.build(self.scene.emitter_powers()).on(self.device)
         return self._light_table
 
-    def resting_bvh(self) -> Any:
+    def resting_bvh(self) -> TriangleBvh:
         if not self.scene.is_animated:
             return self.bvh
         if self._resting_bvh is None:
@@ -91,7 +93,7 @@ class DeviceScene:
             self._resting_bvh = TriangleBvh(self.flat.points, self.flat.indices[rests], self.device.alias, masks)
         return self._resting_bvh
 
-    def _array(self, values: np.ndarray, dtype: Any) -> wp.array:
+    def _array(self, values: np.ndarray, dtype: type) -> wp.array:
         return on_device(values, dtype, self.device)
 
     def placed_emitters(self) -> emitters.PlacedEmitters:

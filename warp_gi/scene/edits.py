@@ -9,21 +9,26 @@ nodes under them, and all lights if one of them moves.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
 from warp_gi.errors import SceneError
 from warp_gi.scene import animation, emitters, geometry, textures
 from warp_gi.scene.model import Material, Mesh, Node, PunctualLight, Texture
-from warp_gi.scene.watching import Change, Watch
+from warp_gi.scene.watching import Change, Owner, Watch
 
 if TYPE_CHECKING:
+    from warp_gi.kernels import types
     from warp_gi.scene.contents import SceneContents
+    from warp_gi.scene.environment import SkyMap
 
 NEW_SCENE = "make a new scene: gi.Scene(scene.nodes, scene.lights, scene.environment, scene.cameras)"
 NEW_SKY = "assign it again: scene.environment = ..."
+
+
+Item = TypeVar("Item", Material, Mesh, Node, PunctualLight)
 
 
 class Edit(NamedTuple):
@@ -40,7 +45,7 @@ class _Slot(NamedTuple):
     vertices: slice
     triangles: slice
     row: int
-    """Of its material in ``Scene.materials``."""
+    """Index of the mesh's material in ``Scene.materials``."""
 
 
 class Edits:
@@ -57,7 +62,7 @@ class Edits:
         self.light_world: list[np.ndarray] = []
         self.light_list: list[PunctualLight] = []
         self.sky_watch: Watch | None = None
-        self.sky_map: Any = None
+        self.sky_map: SkyMap | None = None
 
     def in_use(self) -> None:
         """Watch everything from now on: a device holds all that the scene is made of."""
@@ -229,7 +234,7 @@ class Edits:
         for _, mesh, slot in self._meshes():
             if field is None and mesh.material is material and not _alike(material, scene.materials[slot.row]):
                 field = hint  # of a material that meshes have in place of the scene's own
-        return field and Edit(f"{field} of material {material.name!r} changed")
+        return None if field is None else Edit(f"{field} of material {material.name!r} changed")
 
     def _emission_edit(self) -> Edit | None:
         """Return whether other triangles emit than when the scene was made; materials are read later."""
@@ -274,7 +279,8 @@ class Edits:
         is_other = sky._map is not used
         if used is not None:
             is_other |= used.is_edited()
-            is_other |= sky.pixels is not used.pixels and not np.array_equal(sky.pixels, used.pixels)
+            pixels = sky.pixels
+            is_other |= pixels is None or (pixels is not used.pixels and not np.array_equal(pixels, used.pixels))
         else:
             is_other |= sky.pixels is not None
         if is_other:
@@ -290,13 +296,13 @@ class Edits:
         return None
 
 
-def _geometry(scene: SceneContents) -> list[Any]:
+def _geometry(scene: SceneContents) -> list[Owner]:
     """Return what the flat geometry of a scene is made from."""
     meshes = {id(mesh): mesh for node in scene.nodes for mesh in node.meshes}
     return [(scene, ("nodes", "materials")), *scene.nodes, *meshes.values()]
 
 
-def _shading(scene: SceneContents) -> list[Any]:
+def _shading(scene: SceneContents) -> list[Owner]:
     """Return materials, textures and lights of a scene."""
     used = [*scene.materials, *(mesh.material for node in scene.nodes for mesh in node.meshes)]
     materials = list({id(material): material for material in used}.values())
@@ -318,7 +324,7 @@ def _slots(scene: SceneContents) -> list[list[_Slot]]:
     return slots
 
 
-def _row_edit(material: Material, data: Any, row: int, hint: str) -> str | None:
+def _row_edit(material: Material, data: types.SceneData, row: int, hint: str) -> str | None:
     """Return the first field in which a material differs from its row in the tables of a device, or ``hint``."""
     try:
         textures.check_material(material)
@@ -326,7 +332,7 @@ def _row_edit(material: Material, data: Any, row: int, hint: str) -> str | None:
         return hint
     images = textures.distinct_textures([material])
     new, old = textures.material_table([material], images)[0], data.materials.numpy()[row]
-    for field in new.dtype.names:
+    for field in new.dtype.names or ():
         if field not in textures.TEXTURE_SLOTS:
             if not np.array_equal(new[field], old[field]):
                 return field
@@ -335,8 +341,9 @@ def _row_edit(material: Material, data: Any, row: int, hint: str) -> str | None:
         elif new[field] >= 0:
             entry, image = data.textures.numpy()[old[field]], images[new[field]]
             table, texels = textures.texture_table([image])
-            start = int(entry[table.dtype.names[0]])
-            is_same = all(entry[name] == table[0][name] for name in table.dtype.names[1:])
+            first, *others = table.dtype.names or ()
+            start = int(entry[first])
+            is_same = all(entry[name] == table[0][name] for name in others)
             if not is_same or not np.array_equal(data.texels.numpy()[start : start + len(texels)], texels):
                 return f"{field} {image.name!r}"
     return None
@@ -360,17 +367,17 @@ def _are_lights_read_anew(scene: SceneContents) -> bool:
     return any(light.node is not None and light.node < len(moving) and moving[light.node] for light in scene.lights)
 
 
-def _missing(items: Iterable[Any], others: Iterable[Any]) -> list[Any]:
+def _missing(items: Iterable[Item], others: Iterable[object]) -> list[Item]:
     """Return the items that are not among others, by identity."""
     known = {id(other) for other in others}
     return [item for item in items if id(item) not in known]
 
 
-def _index(items: Iterable[Any], wanted: Any) -> int | None:
+def _index(items: Iterable[object], wanted: object) -> int | None:
     return next((index for index, item in enumerate(items) if item is wanted), None)
 
 
-def _come_or_gone(now: list[Any], old: list[Any]) -> str:
+def _come_or_gone(now: Sequence[Item], old: Sequence[Item]) -> str:
     """Return the name of the first item that was added or removed, and which of both."""
     if len(now) > len(old):
         return f"{(_missing(now, old) or now)[0].name!r} was added"

@@ -21,7 +21,7 @@ LIGHT_KINDS = {
 }
 
 SMALLEST_AREA = 1e-18
-"""Square metres; a smaller triangle cannot be sampled in float32 and is no emitter."""
+"""Area in square metres below which a triangle cannot be sampled in float32, and is no emitter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +29,11 @@ class PlacedEmitters:
     """The emitters of a scene, where they are in the pose of one device; see ``Scene.placed_emitters``."""
 
     table: np.ndarray
-    """types.Emitter [emitter]: emissive triangles, then punctual lights."""
+    """Emitters, types.Emitter [emitter]: emissive triangles first, then punctual lights."""
     corners: np.ndarray
-    """float64 [emissive triangle, 3, 3]: corners in world space, metres; of the first emitters of the table."""
+    """Corners in world space of the table's emissive triangles, metres, float64 [emissive triangle, 3, 3]."""
     two_sided: np.ndarray
-    """bool [emissive triangle]: whether both sides shine."""
+    """Whether both sides shine, bool [emissive triangle]."""
 
 
 def check_light(light: PunctualLight, nodes: Sequence[Node]) -> None:
@@ -72,7 +72,7 @@ def emissive_triangles(flat: FlatGeometry, materials: Sequence[Material]) -> tup
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     powers = np.pi * 0.5 * np.linalg.norm(cross.astype(np.float64), axis=1)
     powers[powers < np.pi * SMALLEST_AREA] = 0.0
-    for index in np.flatnonzero(shining):
+    for index in np.flatnonzero(shining).tolist():
         mine = flat.materials[triangles] == index
         material = materials[index]
         radiance = np.asarray(material.emission, np.float64)
@@ -106,7 +106,7 @@ def emitter_table(triangles: np.ndarray, lights: Sequence[PunctualLight], world:
         direction = matrix[:3, :3] @ np.asarray(light.direction, np.float64)
         row["kind"] = LIGHT_KINDS[light.kind]
         row["position"] = matrix[:3, :3] @ np.asarray(light.position, np.float64) + matrix[:3, 3]
-        row["direction"] = direction / max(np.linalg.norm(direction), 1e-30)
+        row["direction"] = direction / max(float(np.linalg.norm(direction)), 1e-30)
         row["intensity"] = light.intensity
         row["cos_inner"], row["cos_outer"] = np.cos(light.inner_cone), np.cos(light.outer_cone)
         row["range"] = light.range or 0.0

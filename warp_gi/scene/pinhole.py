@@ -12,6 +12,9 @@ import warp as wp
 from warp_gi.errors import OptionError
 from warp_gi.kernels import gbuffer
 
+Vector = Sequence[float] | np.ndarray
+"""Three numbers, for a position or a direction."""
+
 LARGEST_SIDE = 1 << 16  # pixels; their Morton code has 16 bits an axis
 LARGEST_COUNT = 1 << 30  # pixels; kernels count them in int32
 
@@ -25,9 +28,9 @@ class Camera:
     """
 
     world_from_camera: np.ndarray
-    """float64 [4, 4], acting on column vectors; its axes are made orthonormal."""
+    """Placement, float64 [4, 4], acting on column vectors; its axes are made orthonormal."""
     hfov: float = 65.0
-    """Horizontal field of view, degrees."""
+    """Horizontal field of view in degrees."""
     resolution: tuple[int, int] = (960, 540)
     """Width and height in pixels."""
     name: str = ""
@@ -60,9 +63,9 @@ class Camera:
     @classmethod
     def look_at(
         cls,
-        eye: Sequence[float],
-        target: Sequence[float],
-        up: Sequence[float] = (0.0, 1.0, 0.0),
+        eye: Vector,
+        target: Vector,
+        up: Vector = (0.0, 1.0, 0.0),
         hfov: float = 65.0,
         resolution: tuple[int, int] = (960, 540),
         name: str = "",
@@ -99,8 +102,9 @@ class Camera:
         return xy + np.array([0.5 * width, 0.5 * height])
 
 
-def _look_at_matrix(eye: Sequence[float], target: Sequence[float], up: Sequence[float]) -> np.ndarray:
-    eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
+def _look_at_matrix(*given: Vector) -> np.ndarray:
+    """Return world_from_camera of an eye, a target and a way up, float64 [4, 4]."""
+    eye, target, up = (np.asarray(v, dtype=np.float64) for v in given)
     if eye.shape != (3,) or target.shape != (3,) or up.shape != (3,):
         raise OptionError("eye, target and up must be three numbers each")
     back = eye - target

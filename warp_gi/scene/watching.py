@@ -25,8 +25,12 @@ _PLAIN = (bool, int, float, str, tuple, type(None))
 class Change(NamedTuple):
     """A field that may have been edited."""
 
-    owner: Any
+    owner: object
     field: str
+
+
+Owner = object | tuple[object, tuple[str, ...]]
+"""A dataclass instance, all of whose fields count; or an object and the names of those that do."""
 
 
 class Watch:
@@ -38,13 +42,13 @@ class Watch:
             can be copied and pickled; else by 64-bit checksums, as fast as memory is read.
     """
 
-    def __init__(self, owners: Sequence[Any], bare: bool = False) -> None:
+    def __init__(self, owners: Sequence[Owner], bare: bool = False) -> None:
         pairs = [owner if isinstance(owner, tuple) else (owner, _field_names(owner)) for owner in owners]
         self._owners = [(owner, names, attrgetter(*names)) for owner, names in pairs]  # of two names at least
         self._values: list[tuple[Any, ...]] = [get(owner) for owner, _, get in self._owners]
-        self._lists: list[tuple[Change, list[Any], list[Any]]] = []
+        self._lists: list[tuple[Change, list[object], list[object]]] = []
         self._arrays: list[tuple[Change, np.ndarray]] = []
-        self._others: list[tuple[Change, Any, int]] = []
+        self._others: list[tuple[Change, object, int]] = []
         seen: set[int] = set()
         for (owner, names, _), values in zip(self._owners, self._values, strict=True):
             for name, value in zip(names, values, strict=True):
@@ -53,7 +57,7 @@ class Watch:
                     self._add(Change(owner, name), value, bare)
         self._sums = None if bare else _Checksums([array for _, array in self._arrays])
 
-    def _add(self, change: Change, value: Any, bare: bool) -> None:
+    def _add(self, change: Change, value: object, bare: bool) -> None:
         if isinstance(value, np.ndarray):
             if _is_immutable(value):
                 return
@@ -103,13 +107,13 @@ class _Checksums:
             table["address"] = starts[self.index] + offset.astype(np.uint64)
             table["size"] = np.minimum(sizes[self.index] - offset, CHUNK)
         self.device = get_device("cpu")
-        self.chunks = wp.array(table, dtype=checksum.MemoryChunk, device=self.device, copy=False)
+        self.chunks: wp.array = wp.array(table, dtype=checksum.MemoryChunk, device=self.device, copy=False)
         self.sums = self._compute()
 
     def _compute(self) -> np.ndarray:
         sums = np.zeros(len(self.index), np.uint64)
         if len(sums):  # one launch: memory limits it, not a core
-            target = wp.array(sums, dtype=wp.uint64, device=self.device, copy=False)
+            target: wp.array = wp.array(sums, dtype=wp.uint64, device=self.device, copy=False)
             launch(checksum.sum_chunks, len(sums), [self.chunks, target], self.device, smallest_slice=len(sums))
         return sums
 
@@ -137,8 +141,8 @@ def _is_immutable(array: np.ndarray) -> bool:
     return isinstance(base, bytes)
 
 
-def _crc(value: Any) -> int:
+def _crc(value: object) -> int:
     array = np.asarray(value)
     if array.dtype.kind not in "biuf":
         return 0
-    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8), array.nbytes)
+    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data, array.nbytes)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -118,6 +119,8 @@ def write_exr(
         else:
             spec.attribute(name, plain(value))
     output = oiio.ImageOutput.create("exr")
+    if output is None:
+        raise OSError(f"cannot write {path}: {one_line(oiio.geterror(), 'OpenImageIO has no writer of EXR files')}")
     written = output.open(str(path), spec) and output.write_image(pixels)
     problem = output.geterror()
     closed = output.close()
@@ -162,8 +165,9 @@ def read_exr(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Attribu
         buffers[buffer] = values.astype(np.int32) if buffer in _INTEGER else values
     attributes: dict[str, Attribute] = {}
     for item in spec.extra_attribs:
+        value: Any = item.value
         is_matrix = str(item.type) == "matrix"
-        attributes[item.name] = np.array(item.value, np.float32).reshape(4, 4) if is_matrix else item.value
+        attributes[item.name] = np.array(value, np.float32).reshape(4, 4) if is_matrix else value
     return buffers, attributes, {buffer: formats[indices[0]] for buffer, indices in groups.items()}
 
 

@@ -13,7 +13,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -29,14 +29,37 @@ TIMES = "warp_gi/seconds/"
 
 
 class FrameLike(Protocol):
-    """What is written of a frame; ``warp_gi.Frame`` and ``FrameFile`` both fit."""
+    """What is written of a frame; ``warp_gi.Frame`` fits."""
 
-    names: Any
-    index: int
-    time: float
-    camera: Camera
-    timings: Mapping[str, float]
-    metadata: Mapping[str, str | int | float]
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the buffers to write."""
+        ...
+
+    @property
+    def index(self) -> int:
+        """Number of the frame."""
+        ...
+
+    @property
+    def time(self) -> float:
+        """Time of the frame in seconds from the first one."""
+        ...
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of the frame."""
+        ...
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Wall seconds by stage."""
+        ...
+
+    @property
+    def metadata(self) -> Mapping[str, str | int | float]:
+        """What decides the pixels beside camera and time, by name."""
+        ...
 
     def numpy(self, name: str) -> np.ndarray:
         """Return a buffer, [height, width] or [height, width, channels]."""
@@ -48,17 +71,17 @@ class FrameFile:
     """A frame read back from its file."""
 
     buffers: dict[str, np.ndarray]
-    """float32 [height, width] or [height, width, channels]; identifiers are int32."""
+    """Buffers by name, float32 [height, width] or [height, width, channels]; identifiers are int32."""
     formats: dict[str, str]
-    """Stored as "half" or "float", by buffer."""
+    """Storage format by buffer, "half" or "float"."""
     index: int
     time: float
-    """Seconds."""
+    """Time of the frame in seconds from the first one."""
     camera: Camera | None
-    """None in files by other programs."""
+    """Camera of the frame; None in files by other programs."""
     metadata: dict[str, str | int | float]
     timings: dict[str, float] = field(default_factory=dict)
-    """Seconds by stage."""
+    """Wall seconds by stage."""
     attributes: dict[str, Attribute] = field(default_factory=dict)
     """Every attribute of the file, under its own name."""
 
@@ -94,10 +117,10 @@ def parse_frames(text: str) -> list[int]:
     frames: dict[int, None] = {}
     for part in text.split(","):
         match = re.fullmatch(r"\s*(\d+)(?:-(\d+)(?::(\d+))?)?\s*", part)
-        first, last, step = (int(g) if g else None for g in match.groups()) if match else (0, -1, 1)
-        if not match or (last is not None and last < first) or step == 0:
+        first, last, step = match.groups() if match else ("1", "0", None)
+        span = range(int(first), int(last or first) + 1, max(int(step or 1), 1))
+        if not span or (step is not None and int(step) == 0):
             raise OptionError(f"frames {text!r} not understood; write for example 5, 0-47, 0-47:2 or 1,4,9-12")
-        span = range(first, (first if last is None else last) + 1, step or 1)
         if len(span) + len(frames) > MOST_FRAMES:
             raise OptionError(f"frames {text!r} are more than {MOST_FRAMES:,}; render them in parts")
         frames.update(dict.fromkeys(span))
@@ -172,7 +195,15 @@ def write_frame(frame: FrameLike, pattern: str | Path, precision: str = "half") 
     return path
 
 
-def write_preview(frame: FrameLike, path: str | Path, exposure: float = 0.0) -> Path:
+class HasBuffers(Protocol):
+    """What previews are made of: ``warp_gi.Frame``, or a ``FrameFile`` read back."""
+
+    def numpy(self, name: str) -> np.ndarray:
+        """Return a buffer, [height, width] or [height, width, channels]."""
+        ...
+
+
+def write_preview(frame: HasBuffers, path: str | Path, exposure: float = 0.0) -> Path:
     """Write the tone-mapped beauty as PNG, from the values that the EXR stores; ``exposure`` is in stops."""
     write_png(path, tone_map(stored_values("beauty", frame.numpy("beauty")), exposure))
     return Path(path)
@@ -181,12 +212,13 @@ def write_preview(frame: FrameLike, path: str | Path, exposure: float = 0.0) -> 
 def read_frame(path: str | Path) -> FrameFile:
     """Read a frame's buffers and metadata back; raises SceneError when the file is missing or not whole."""
     buffers, attributes, formats = read_exr(path)
-    metadata = {k[len(PREFIX) :]: v for k, v in attributes.items() if k.startswith(PREFIX) and not k.startswith(TIMES)}
-    timings = {k[len(TIMES) :]: float(v) for k, v in attributes.items() if k.startswith(TIMES)}
-    camera = None
-    if "worldToCamera" in attributes and "hfov" in attributes:
+    numbers = {name: value for name, value in attributes.items() if not isinstance(value, np.ndarray)}
+    metadata = {k[len(PREFIX) :]: v for k, v in numbers.items() if k.startswith(PREFIX) and not k.startswith(TIMES)}
+    timings = {k[len(TIMES) :]: float(v) for k, v in numbers.items() if k.startswith(TIMES)}
+    camera, world_to_camera = None, attributes.get("worldToCamera")
+    if isinstance(world_to_camera, np.ndarray) and "hfov" in attributes:
         height, width = next(iter(buffers.values())).shape[:2]
-        world_from_camera = np.linalg.inv(attributes["worldToCamera"].astype(np.float64).T) @ np.diag([1.0, 1, -1, 1])
+        world_from_camera = np.linalg.inv(world_to_camera.astype(np.float64).T) @ np.diag([1.0, 1, -1, 1])
         camera = Camera(world_from_camera, float(attributes["hfov"]), (width, height))
     return FrameFile(
         buffers,

@@ -42,7 +42,7 @@ def magma(values: np.ndarray) -> np.ndarray:
     import OpenImageIO as oiio
 
     source = oiio.ImageBuf(np.ascontiguousarray(np.clip(values, 0, 1), np.float32)[:, :, None])
-    return to_bytes(oiio.ImageBufAlgo.color_map(source, 0, "magma").get_pixels(oiio.FLOAT)[:, :, :3])
+    return to_bytes(np.asarray(oiio.ImageBufAlgo.color_map(source, 0, "magma").get_pixels(oiio.FLOAT))[:, :, :3])
 
 
 def write_pngs(folder: str | Path, pictures: Mapping[str, np.ndarray]) -> list[Path]:

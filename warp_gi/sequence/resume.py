@@ -95,7 +95,7 @@ class Shot:
     """Number of the frame that motion is towards."""
     path: Path
     time: float
-    """Time in seconds."""
+    """Time of the frame in seconds from the first one."""
     camera: Camera
     previous_camera: Camera
     lineage: str = ""
@@ -115,7 +115,7 @@ class Plan:
     restart: str = ""
     """Reason why the sequence is rendered from its first frame though some are there; "" if it is not."""
     dependence: Dependence = Dependence((), ())
-    """How frames depend on those before."""
+    """Dependence of the frames on those before them."""
 
     @property
     def done(self) -> tuple[Shot, ...]:

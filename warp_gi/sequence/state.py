@@ -22,9 +22,9 @@ class Dependence:
     """How the frames of a sequence depend on those before them."""
 
     on_past: tuple[str, ...]
-    """Places in the pipeline of what makes them depend: terms, "indirect.ends_in", "denoiser", names of services."""
+    """Places in the pipeline that make frames depend: terms, "indirect.ends_in", "denoiser", names of services."""
     unsaved: tuple[str, ...]
-    """Those among them whose state no file keeps."""
+    """Places among ``on_past`` whose state no file keeps."""
 
     @property
     def kind(self) -> Literal["independent", "saved", "unsaved"]:
@@ -58,7 +58,7 @@ def with_arrays(state: Any, arrays: Mapping[str, np.ndarray], device: wp.Device,
     Raises KeyError where ``arrays`` lacks one, ValueError where its items do not fit.
     """
     if isinstance(state, wp.array):
-        restored = wp.array(arrays[name], dtype=state.dtype, device=device)
+        restored: wp.array = wp.array(arrays[name], dtype=state.dtype, device=device)
         if restored.ndim != state.ndim:
             raise ValueError(f"{name} has {arrays[name].ndim} dimensions")
         return restored
@@ -71,13 +71,13 @@ def with_arrays(state: Any, arrays: Mapping[str, np.ndarray], device: wp.Device,
     parts = {key: with_arrays(value, arrays, device, f"{name}.{key}" if name else key) for key, value in _parts(state)}
     if isinstance(state, dict):
         return parts
-    if is_dataclass(state):
+    if is_dataclass(state) and not isinstance(state, type):
         return replace(state, **parts)
     if _is_struct(state):
-        restored = copied(state, state._cls)
+        struct = copied(state, state._cls)
         for key, value in parts.items():
-            setattr(restored, key, value)
-        return restored
+            setattr(struct, key, value)
+        return struct
     return state
 
 

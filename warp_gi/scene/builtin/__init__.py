@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import importlib
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from warp_gi.errors import unknown_name
@@ -23,7 +24,7 @@ BUILTIN_SCENES = {
     "two_rooms": "one lit and one dark room with a thin wall between them",
     "warehouse": "rooms of shelves under hundreds of lamps, most of them hidden from any one point",
 }
-"""What there is: name and a line about it."""
+"""Built-in scenes by name, with a line about each."""
 
 
 def builtin_scene(name: str) -> Scene:
@@ -42,7 +43,7 @@ def builtin_camera_path(name: str) -> CameraPath:
     return _module(name).camera_path()
 
 
-def _module(name: str) -> object:
+def _module(name: str) -> ModuleType:
     if name not in BUILTIN_SCENES:
         raise unknown_name("built-in scene", name, BUILTIN_SCENES)
     return importlib.import_module(f"warp_gi.scene.builtin.{name}")

@@ -177,7 +177,8 @@ def foliage(
     flat = np.cross(b - a, c - a)
     normals = np.zeros((count, 5, 3))
     for k in range(3):
-        np.add.at(normals, (slice(None), faces[:, k]), flat)
+        for face, corner in enumerate(faces[:, k]):
+            normals[:, corner] += flat[:, face]
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
     uvs = np.broadcast_to(outline[:, :2] * [1, 1] + [0, 0.5], (count, 5, 2))
     return Shape(

@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warp_gi.scene.builtin import materials
 from warp_gi.scene.builtin import textures as tx
@@ -24,17 +25,17 @@ LOW, HIGH = np.array((-25.0, -1.0, -21.0)), np.array((11.0, 12.0, 13.0))  # of t
 CELL = 0.25
 SKY = SunSky(elevation=60.0, azimuth=300.0, turbidity=2.6, intensity=1.0)
 SPOT = np.array((4.3, 0.0, 2.4))
-"""Where the sun meets the floor."""
+"""Point on the floor that the sun reaches, metres."""
 SHAFT_RADIUS = 1.4
 CAVERN = ((-0.5, 1.2, 0.0), (8.0, 5.2, 7.0))
-"""Middle and radii of the ellipsoid."""
+"""Centre and radii of the cavern's ellipsoid, metres."""
 TUNNEL_RADIUS = 1.75
 TUNNELS = {
     "west": ((-6.0, 1.1, 1.0), (-11.0, 1.1, 2.5), (-16.0, 1.1, 1.2), (-22.0, 1.1, 4.5)),
     "north": ((2.5, 1.1, -5.0), (4.5, 1.1, -10.0), (2.0, 1.1, -14.0), (-1.0, 1.1, -18.0)),
     "gallery": ((-16.0, 1.1, 1.2), (-15.0, 1.1, -6.0), (-10.0, 1.1, -12.5), (-1.0, 1.1, -18.0)),
 }
-"""Corners of their middle lines."""
+"""Corners of the tunnels' middle lines, metres, by name."""
 OCTAVES = ((4.5, 0.85), (1.9, 0.45), (0.8, 0.20))
 """Wavelength and amplitude of the rock's relief, metres."""
 PROP_STEP = 2.8
@@ -81,10 +82,10 @@ def field(axes: list[np.ndarray]) -> np.ndarray:
     return np.minimum(hollow, shaft)
 
 
-def _from_line(x: np.ndarray, y: np.ndarray, z: np.ndarray, start: Sequence[float], end: Sequence[float]) -> np.ndarray:
+def _from_line(x: np.ndarray, y: np.ndarray, z: np.ndarray, start: ArrayLike, end: ArrayLike) -> np.ndarray:
     """Return distances to a straight line from ``start`` to ``end``."""
-    start, along = np.asarray(start, np.float32), np.subtract(end, start).astype(np.float32)
-    offsets = [value - s for value, s in zip((x, y, z), start, strict=True)]
+    along = np.subtract(end, start).astype(np.float32)
+    offsets = [value - s for value, s in zip((x, y, z), np.asarray(start, np.float32), strict=True)]
     share = sum(value * a for value, a in zip(offsets, along, strict=True)) / float(along @ along)
     share = np.clip(share, 0, 1)
     return np.sqrt(sum((value - share * a) ** 2 for value, a in zip(offsets, along, strict=True)))
@@ -184,7 +185,7 @@ def stone(name: str, color: Sequence[float], seed: int) -> Material:
     grain, blotches = tx.noise(seed, 1.0, 6), tx.smoothstep(-1.5, 1.5, tx.noise(seed + 1, 1.6, 1))
     rust = 0.55 * tx.smoothstep(0.6, 2.2, tx.noise(seed + 2, 1.6, 2) + 0.3 * grain)
     base = tx.blend(color, np.multiply(color, (0.62, 0.60, 0.58)), blotches)
-    base = tx.blend(base, np.broadcast_to(np.float32((0.42, 0.24, 0.13)), base.shape), rust)
+    base = tx.blend(base, np.broadcast_to(np.array((0.42, 0.24, 0.13), np.float32), base.shape), rust)
     relief = 0.012 * tx.noise(seed + 3, 1.5, 2, 120)
     return materials.textured(name, base * (1 + 0.10 * grain)[..., None], 0.9, relief, 3.0)
 
@@ -194,16 +195,15 @@ def stone(name: str, color: Sequence[float], seed: int) -> Material:
 
 def along(path: Sequence[Sequence[float]], step: float, first: float) -> list[tuple[np.ndarray, float]]:
     """Return points on the ground below ``path`` every ``step`` metres, and the turn that makes z run along it."""
-    path = np.asarray(path, np.float64) * (1, 0, 1)
-    lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    corners = np.asarray(path, np.float64) * (1, 0, 1)
+    lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
     starts = np.concatenate([[0], np.cumsum(lengths)])
     result = []
     for distance in np.arange(first, starts[-1], step):
         k = int(np.searchsorted(starts, distance, "right")) - 1
-        direction = (path[k + 1] - path[k]) / lengths[k]
-        result.append(
-            (path[k] + direction * (distance - starts[k]), math.degrees(math.atan2(direction[0], direction[2])))
-        )
+        direction = (corners[k + 1] - corners[k]) / lengths[k]
+        turn = math.degrees(math.atan2(direction[0], direction[2]))
+        result.append((corners[k] + direction * (distance - starts[k]), turn))
     return result
 
 
@@ -302,8 +302,9 @@ def crates() -> Shape:
         (-3.7, 0.8, -4.0, 0.55),
         (0.4, 0, 4.3, 0.8),
         (1.3, 0, 4.5, 0.6),
+        (-12.4, 0, 3.2, 0.5),
+        (-1.2, 0, -9.0, 0.5),
     )
-    places += ((-12.4, 0, 3.2, 0.5), (-1.2, 0, -9.0, 0.5))
     parts = []
     for x, y, z, size in places:
         crate = box((-size / 2, 0, -size / 2), (size / 2, size, size / 2), 0.015).turned(rng.uniform(-20, 20))

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warp_gi.scene.model import Material, Mesh
 from warp_gi.scene.normals import smooth_mesh
@@ -23,23 +24,24 @@ class Shape:
     """Triangles; every operation returns a new shape."""
 
     points: np.ndarray
-    """float64 [vertex, 3]"""
+    """Positions in metres, float64 [vertex, 3]."""
     indices: np.ndarray
-    """int32 [triangle, 3]"""
+    """Vertices of each triangle, int32 [triangle, 3]."""
     uvs: np.ndarray
-    """float64 [vertex, 2]"""
+    """Texture coordinates in metres along the surface, float64 [vertex, 2]."""
     normals: np.ndarray
-    """float64 [vertex, 3] unit"""
+    """Unit shading normals, float64 [vertex, 3]."""
 
     @staticmethod
-    def of(points: np.ndarray, indices: np.ndarray, uvs: np.ndarray | None = None, crease: float = 40.0) -> Shape:
+    def of(points: ArrayLike, indices: ArrayLike, uvs: ArrayLike | None = None, crease: float = 40.0) -> Shape:
         """Return the shape of welded vertices, smooth where faces meet at less than ``crease`` degrees."""
-        points = np.asarray(points, np.float64).reshape(-1, 3)
-        indices = np.asarray(indices, np.int32).reshape(-1, 3)
-        uvs = np.zeros((len(points), 2)) if uvs is None else np.asarray(uvs, np.float64).reshape(-1, 2)
-        a, b, c = (points[indices[:, k]] for k in range(3))
+        vertices = np.asarray(points, np.float64).reshape(-1, 3)
+        faces = np.asarray(indices, np.int32).reshape(-1, 3)
+        places = np.zeros((len(vertices), 2)) if uvs is None else np.asarray(uvs, np.float64).reshape(-1, 2)
+        a, b, c = (vertices[faces[:, k]] for k in range(3))
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-        mesh = smooth_mesh(Mesh(points, indices[area > SMALLEST_AREA], uvs=uvs), crease)
+        mesh = smooth_mesh(Mesh(vertices, faces[area > SMALLEST_AREA], uvs=places), crease)
+        assert mesh.uvs is not None and mesh.normals is not None  # smooth_mesh makes both
         return Shape(mesh.points, mesh.indices, mesh.uvs, mesh.normals.astype(np.float64))
 
     def transformed(self, matrix: np.ndarray) -> Shape:
@@ -107,9 +109,7 @@ class Shape:
         return Mesh(points, indices, material, normals, self.uvs.astype(np.float32), name)
 
 
-def placement(
-    position: Sequence[float] = (0, 0, 0), turn: float = 0.0, axis: str = "y", scale: float = 1.0
-) -> np.ndarray:
+def placement(position: ArrayLike = (0, 0, 0), turn: float = 0.0, axis: str = "y", scale: float = 1.0) -> np.ndarray:
     """Return the float64 [4, 4] that scales, then turns by degrees about a coordinate axis, then translates."""
     angle = math.radians(turn)
     c, s = math.cos(angle), math.sin(angle)
@@ -149,18 +149,18 @@ def loft(grid: np.ndarray, uvs: np.ndarray | None = None, crease: float = 40.0) 
     return Shape.of(grid, (corner[:, None, :] + triangles[None]).reshape(-1, 3), uvs, crease)
 
 
-def quad(corner: Sequence[float], edge_u: Sequence[float], edge_v: Sequence[float]) -> Shape:
+def quad(corner: ArrayLike, edge_u: ArrayLike, edge_v: ArrayLike) -> Shape:
     """Return the parallelogram whose front is edge_u x edge_v, its uvs in metres from ``corner``."""
-    corner, edge_u, edge_v = (np.asarray(x, np.float64) for x in (corner, edge_u, edge_v))
-    points = np.stack([corner, corner + edge_u, corner + edge_u + edge_v, corner + edge_v])
-    a, b = np.linalg.norm(edge_u), np.linalg.norm(edge_v)
-    return Shape.of(points, [[0, 1, 2], [0, 2, 3]], [[0, 0], [a, 0], [a, b], [0, b]])
+    start, u, v = (np.asarray(x, np.float64) for x in (corner, edge_u, edge_v))
+    points = np.stack([start, start + u, start + u + v, start + v])
+    a, b = float(np.linalg.norm(u)), float(np.linalg.norm(v))
+    return Shape.of(points, [[0, 1, 2], [0, 2, 3]], [[0.0, 0.0], [a, 0.0], [a, b], [0.0, b]])
 
 
-def box(lower: Sequence[float], upper: Sequence[float], bevel: float = 0.0) -> Shape:
+def box(lower: ArrayLike, upper: ArrayLike, bevel: float = 0.0) -> Shape:
     """Return the closed box between two corners, its edges cut off by ``bevel`` metres; uvs are box-mapped."""
-    lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
-    half, signs = (upper - lower) / 2, np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    low, high = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
+    half, signs = (high - low) / 2, np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     bevel = min(bevel, 0.49 * 2 * half.min())
     faces = []
     index = {tuple(s): k for k, s in enumerate(signs.tolist())}
@@ -181,30 +181,30 @@ def box(lower: Sequence[float], upper: Sequence[float], bevel: float = 0.0) -> S
             faces.append(corners if side > 0 else corners[::-1])
         for s in (-1, 1):
             for t in (-1, 1):  # the cut edge along this axis, between the faces across `one` and `two`
-                low, high = [0, 0, 0], [0, 0, 0]
-                low[axis], low[one], low[two] = -1, s, t
-                high[axis], high[one], high[two] = 1, s, t
-                corners = [vertex(low, one), vertex(low, two), vertex(high, two), vertex(high, one)]
+                start, end = [0, 0, 0], [0, 0, 0]
+                start[axis], start[one], start[two] = -1, s, t
+                end[axis], end[one], end[two] = 1, s, t
+                corners = [vertex(start, one), vertex(start, two), vertex(end, two), vertex(end, one)]
                 faces.append(corners if s * t > 0 else corners[::-1])
     triangles = [t for f in faces for t in ([f[0], f[1], f[2]], [f[0], f[2], f[3]])]
-    for k, sign in enumerate(signs):
+    for k, outwards in enumerate(signs):
         corner = [3 * k, 3 * k + 1, 3 * k + 2]
-        triangles.append(corner if sign.prod() > 0 else corner[::-1])
-    return Shape.of(points + (lower + upper) / 2, triangles, crease=30.0).box_mapped()
+        triangles.append(corner if outwards.prod() > 0 else corner[::-1])
+    return Shape.of(points + (low + high) / 2, triangles, crease=30.0).box_mapped()
 
 
-def lathe(profile: Sequence[Sequence[float]], segments: int = 24, crease: float = 35.0) -> Shape:
+def lathe(profile: ArrayLike, segments: int = 24, crease: float = 35.0) -> Shape:
     """Return the surface of revolution about y of ``profile``, (radius, height) pairs from bottom to top.
 
     Starting and ending at radius 0 closes it.
     """
-    profile = np.asarray(profile, np.float64)
+    line = np.asarray(profile, np.float64)
     angle = np.linspace(0, 2 * math.pi, segments + 1)
     angle[-1] = 0.0  # the seam's points coincide to the last bit
-    radius, height = profile[:, :1], np.broadcast_to(profile[:, 1:], (len(profile), segments + 1))
+    radius, height = line[:, :1], np.broadcast_to(line[:, 1:], (len(line), segments + 1))
     grid = np.stack([radius * np.cos(angle), height, radius * np.sin(angle)], axis=-1)
-    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
-    around = np.linspace(0, 2 * math.pi, segments + 1) * profile[:, 0].max()
+    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    around = np.linspace(0, 2 * math.pi, segments + 1) * line[:, 0].max()
     return loft(grid, np.stack(np.broadcast_arrays(around[None, :], length[:, None]), axis=-1), crease)
 
 
@@ -303,12 +303,12 @@ def ribbon_ring(profile: Sequence[Sequence[float]], half_x: float, half_z: float
     ``profile`` is a closed polygon of (projection, height), anticlockwise with projection to the right: projection
     runs towards the middle of the rectangle, or away from it if not ``inward``.
     """
-    profile = np.asarray([*profile, profile[0]], np.float64)
+    line = np.asarray([*profile, profile[0]], np.float64)
     sign = -1.0 if inward else 1.0
     corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]])
-    x = corners[:, :1] * (half_x + sign * profile[:, 0])
-    z = corners[:, 1:] * (half_z + sign * profile[:, 0])
-    grid = np.stack([x, np.broadcast_to(profile[:, 1], x.shape), z], axis=-1)
+    x = corners[:, :1] * (half_x + sign * line[:, 0])
+    z = corners[:, 1:] * (half_z + sign * line[:, 0])
+    grid = np.stack([x, np.broadcast_to(line[:, 1], x.shape), z], axis=-1)
     shape = loft(grid, crease=30.0)
     return (shape if inward else shape.flipped()).box_mapped()
 

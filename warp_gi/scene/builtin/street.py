@@ -50,9 +50,9 @@ def window(shutter_angle: float) -> dict[str, Shape]:
     bars = [box((-w / 2, y, -0.18), (-w / 2 + 0.06, y + h, -0.1)), box((w / 2 - 0.06, y, -0.18), (w / 2, y + h, -0.1))]
     bars += [box((-w / 2, y + b, -0.18), (w / 2, y + b + 0.06, -0.1)) for b in (0.0, 0.62 * h, h - 0.06)]
     bars.append(box((-0.03, y, -0.17), (0.03, y + h, -0.11)))
-    blade = [box((0, 0, 0.01), (w / 2, h, 0.045))]
-    blade += [box((0.07, b, 0.005), (w / 2 - 0.07, b + 0.41 * h, 0.052)) for b in (0.06 * h, 0.53 * h)]
-    blade = merge(blade)
+    boards = [box((0, 0, 0.01), (w / 2, h, 0.045))]
+    boards += [box((0.07, b, 0.005), (w / 2 - 0.07, b + 0.41 * h, 0.052)) for b in (0.06 * h, 0.53 * h)]
+    blade = merge(boards)
     right = blade.turned(-shutter_angle).moved(w / 2, y, 0)
     left = blade.scaled(-1, 1, 1).turned(shutter_angle).moved(-w / 2, y, 0)
     return {

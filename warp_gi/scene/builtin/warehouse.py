@@ -135,13 +135,14 @@ def scene() -> Scene:
         ),
     ]
     housing = materials.plain("lamp housing", (0.5, 0.5, 0.5), 0.5)
-    lights = [materials.lamp(f"lamp {k}", tuple(RADIANCE * c for c in tint)) for k, tint in enumerate(TINTS)]
+    tints = [(RADIANCE * r, RADIANCE * g, RADIANCE * b) for r, g, b in TINTS]
+    lights = [materials.lamp(f"lamp {k}", tint) for k, tint in enumerate(tints)]
     for column in range(COLUMNS):
         for row in range(ROWS):
             glow, cases = lamps(column, row)
-            tint = lights[(column + 2 * row) % len(lights)]
+            light = lights[(column + 2 * row) % len(lights)]
             name = f"lamps {column} {row}"
-            nodes.append(Node(name, [glow.mesh(tint, name), cases.mesh(housing, f"{name} housings")]))
+            nodes.append(Node(name, [glow.mesh(light, name), cases.mesh(housing, f"{name} housings")]))
     cameras = {
         "main": Camera.look_at((-9.7, 1.75, -7.85), (0.0, 1.6, -8.35), hfov=75.0),
         "corner": Camera.look_at((19.3, 2.2, 11.3), (10.0, 1.4, 4.0), hfov=75.0),

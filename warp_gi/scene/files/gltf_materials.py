@@ -5,9 +5,9 @@ from __future__ import annotations
 import urllib.parse
 import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pygltflib
 
 from warp_gi.errors import SceneError
 from warp_gi.scene.files.gltf_buffers import Buffers, decode_data_uri
@@ -21,7 +21,7 @@ BLEND_CUTOFF = 0.5
 class MaterialReader:
     """Makes each material and each texture of a document once."""
 
-    def __init__(self, document: Any, buffers: Buffers) -> None:
+    def __init__(self, document: pygltflib.GLTF2, buffers: Buffers) -> None:
         self.document, self.buffers = document, buffers
         self._materials: dict[int | None, Material] = {}
         self._images: dict[int, np.ndarray] = {}
@@ -40,7 +40,7 @@ class MaterialReader:
         name = source.name or f"material {index}"
         extensions = source.extensions or {}
         surface = source.pbrMetallicRoughness
-        color = list(surface.baseColorFactor or (1.0,) * 4) if surface else [1.0] * 4
+        red, green, blue, alpha = (surface and surface.baseColorFactor) or (1.0,) * 4
         strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
         cutoffs = {"OPAQUE": None, "MASK": 0.5 if source.alphaCutoff is None else source.alphaCutoff}
         specular = extensions.get("KHR_materials_specular", {})
@@ -48,8 +48,8 @@ class MaterialReader:
         normal = source.normalTexture
         return Material(
             name,
-            base_color=tuple(color[:3]),
-            alpha=color[3],
+            base_color=(red, green, blue),
+            alpha=alpha,
             metallic=1.0 if surface is None or surface.metallicFactor is None else surface.metallicFactor,
             roughness=1.0 if surface is None or surface.roughnessFactor is None else surface.roughnessFactor,
             specular=specular.get("specularFactor", 1.0),
@@ -63,7 +63,7 @@ class MaterialReader:
             double_sided=bool(source.doubleSided),
         )
 
-    def _texture(self, info: Any, srgb: bool, material: str) -> Texture | None:
+    def _texture(self, info: pygltflib.TextureInfo | None, srgb: bool, material: str) -> Texture | None:
         if info is None or info.index is None:
             return None
         key = (info.index, srgb)
@@ -73,10 +73,11 @@ class MaterialReader:
                 raise SceneError(
                     f"{str(self.buffers.path)!r}: texture {info.index} of material {material!r} has no image"
                 )
-            wrap = ("repeat", "repeat")
+            wrap: tuple[str, str] = ("repeat", "repeat")
             if texture.sampler is not None:
                 sampler = self.document.samplers[texture.sampler]
-                wrap = tuple(WRAP_MODES.get(mode or 10497, str(mode)) for mode in (sampler.wrapS, sampler.wrapT))
+                u, v = (WRAP_MODES.get(mode or 10497, str(mode)) for mode in (sampler.wrapS, sampler.wrapT))
+                wrap = u, v
             image = self.document.images[texture.source]
             name = texture.name or image.name or (image.uri or "")[:80] or f"image {texture.source}"
             if name.startswith("data:"):
@@ -100,7 +101,7 @@ class MaterialReader:
         return self._images[index]
 
 
-def texture_transform(source: Any) -> tuple[int, np.ndarray]:
+def texture_transform(source: pygltflib.Material) -> tuple[int, np.ndarray]:
     """Return a material's texture coordinate set and its KHR_texture_transform (float64 [3, 3] on v-down uv).
 
     Textures of one material share one set here: that of the first of base colour,

@@ -17,6 +17,7 @@ import re
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from warp_gi.scene.model import Material, Mesh, Node, Texture
 
 METAL_SPECULAR = 0.25
 OPTION_ARGUMENTS = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}
-"""Map options that take more or fewer than one argument."""
+"""Number of arguments of MTL map options that take more or fewer than one."""
 
 
 @dataclass
@@ -57,8 +58,9 @@ def read_obj(path: Path) -> SceneParts:
     if unknown and statements:
         warnings.warn(f"{str(path)!r}: material {unknown[0]!r} is not in its library; plain grey", stacklevel=3)
     reader = _MaterialReader(path, statements)
+    resolver: Any = _NamesOnly(names)  # all of a trimesh Resolver that load_obj calls
     try:
-        contents = load_obj(io.StringIO(text), resolver=_NamesOnly(names))
+        contents = load_obj(io.StringIO(text), resolver=resolver)
     except IndexError as error:
         raise SceneError(
             f"{str(path)!r}: a face names a vertex, texture coordinate or normal that is out of range ({error})"
@@ -96,6 +98,7 @@ class _NamesOnly:
         self.library = "".join(f"newmtl {name}\n" for name in names).encode()
 
     def get(self, name: str) -> bytes:
+        """Return the library, whatever its name."""
         return self.library
 
     __getitem__ = get
