@@ -16,11 +16,11 @@ class AliasTable:
     """A table of n buckets; bucket k yields item k with ``probability[k]`` and item ``index[k]`` otherwise."""
 
     probability: np.ndarray
-    """float32 [n]"""
+    """Probability that a bucket yields its own item, float32 [n]."""
     index: np.ndarray
-    """int32 [n]"""
+    """Item that a bucket yields otherwise, int32 [n]."""
     pdf: np.ndarray
-    """float32 [n] probability of each item as the table really samples it; sums to 1."""
+    """Probability of each item as the table really samples it, float32 [n]; sums to 1."""
 
     def on(self, device: wp.Device) -> wp.array:
         """Return the buckets that kernels read, [n] of types.AliasBucket, on a device."""

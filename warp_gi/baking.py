@@ -22,6 +22,9 @@ from warp_gi import __version__
 from warp_gi.errors import BakeError
 from warp_gi.files import replacing
 
+Setting = str | int | float
+"""Value of a setting in a bake; bool is an int."""
+
 FORMAT = "warp_gi bake"
 FORMAT_VERSION = 2
 _TEXTS = ("technique", "scene_key", "scene_name")
@@ -34,17 +37,17 @@ class Bake:
     """What an estimator computed before the first frame, and what it is valid for."""
 
     technique: str
-    """The estimator's name."""
+    """Class name of the estimator."""
     scene_key: str
     """Hash of just what the bake depends on; for visibility ``Scene.geometry_hash``."""
-    settings: dict[str, Any]
-    """Those the bake depends on: str, int, float or bool."""
+    settings: dict[str, Setting]
+    """Settings of the estimator that the bake depends on: str, int, float or bool, by name."""
     arrays: dict[str, np.ndarray]
-    """bool, u/int8 to 64 or float16 to 64, of any shape."""
+    """Arrays by name: bool, int8 to int64, uint8 to uint64 or float16 to float64, of any shape."""
     counts: dict[str, int | float] = field(default_factory=dict)
-    """What was done: samples, rays, cells, seconds."""
+    """Numbers that say what was done, by name: samples, rays, cells, seconds."""
     scene_name: str = ""
-    """For messages only."""
+    """Name of the scene, for messages only."""
 
     @property
     def nbytes(self) -> int:
@@ -90,11 +93,11 @@ class Bake:
         """Read a bake; see ``load_bake``."""
         return load_bake(path)
 
-    def has(self, settings: Mapping[str, Any]) -> bool:
+    def has(self, settings: Mapping[str, Setting]) -> bool:
         """Return whether the bake was made with these settings."""
         return self.settings == dict(settings)
 
-    def check(self, technique: str, scene_key: str, settings: Mapping[str, Any], scene_name: str = "") -> None:
+    def check(self, technique: str, scene_key: str, settings: Mapping[str, Setting], scene_name: str = "") -> None:
         """Raise BakeError saying why, unless the bake is by ``technique``, of this scene and with these settings."""
         if technique != self.technique:
             raise BakeError(
@@ -228,7 +231,7 @@ def _scene(name: str, key: str) -> str:
     return f"{repr(name) if name else 'an unnamed scene'} (geometry {key[:12]})"
 
 
-def _shown(settings: Mapping[str, Any], name: str) -> str:
+def _shown(settings: Mapping[str, Setting], name: str) -> str:
     if name not in settings:
         return "none"
     return repr(settings[name]) if isinstance(settings[name], str) else str(settings[name])

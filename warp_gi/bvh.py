@@ -30,15 +30,15 @@ class AlphaMasks:
     """Holes cut by textures: a hit where bilinear alpha times factor is below the cutoff is passed through."""
 
     face_mask: np.ndarray
-    """int32 [triangle]: index in ``masks``, -1 is opaque."""
+    """Index in ``masks`` of each triangle's mask, int32 [triangle]; -1 is opaque."""
     masks: Sequence[tuple[int, float, float]]
-    """(index in ``textures`` or -1 for alpha 1, alpha factor, cutoff)."""
+    """Masks as (index in ``textures``, or -1 for alpha 1; factor on alpha; cutoff)."""
     uvs: np.ndarray
-    """float32 [vertex, 2], v up."""
+    """Texture coordinates, float32 [vertex, 2], v up."""
     textures: wp.array
-    """dtype kernels.types.Texture, on the tree's device."""
+    """Textures that masks look up, kernels.types.Texture [texture], on the tree's device."""
     texels: wp.array
-    """uint32 RGBA8, red in the low byte, on the tree's device."""
+    """Texels of all textures, uint32 RGBA8 [texel] with red in the low byte, on the tree's device."""
 
 
 @dataclass(eq=False)
@@ -46,13 +46,13 @@ class Hits:
     """Closest hits, one for each ray. The point is (1 - u - v) p0 + u p1 + v p2 in index-buffer order."""
 
     t: wp.array
-    """float32 [ray], in units of the direction's length; t_max on a miss."""
+    """Distance along the ray, float32 [ray], in units of the direction's length; t_max on a miss."""
     face: wp.array
-    """int32 [ray], -1 on a miss."""
+    """Index of the triangle that was hit, int32 [ray]; -1 on a miss."""
     u: wp.array
-    """float32 [ray]"""
+    """Barycentric weight of the triangle's second vertex, float32 [ray]."""
     v: wp.array
-    """float32 [ray]"""
+    """Barycentric weight of the triangle's third vertex, float32 [ray]."""
 
 
 class TriangleBvh:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Weights of linear Rec. 709 red, green and blue; ``luminance`` of warp_gi.kernels.bsdf has the same."""
+"""Weights of linear Rec. 709 red, green and blue in the luminance, as in ``kernels.bsdf.luminance``; float64 [3]."""
 
 
 def encode_srgb(linear: np.ndarray) -> np.ndarray:
@@ -26,4 +26,4 @@ def decode_srgb(coded: np.ndarray) -> np.ndarray:
 
 
 SRGB_TO_LINEAR = decode_srgb(np.arange(256) / 255.0).astype(np.float32)
-"""float32 [256]: linear value of an 8-bit sRGB code."""
+"""Linear value of each 8-bit sRGB code, float32 [256]."""

@@ -56,14 +56,15 @@ class History:
     """What SpatioTemporal keeps of the last frame."""
 
     index: int
-    """Of the frame."""
+    """Number of the frame."""
     resolution: tuple[int, int]
-    scene: tuple[Any, int]
+    """Width and height of the frame in pixels."""
+    scene: tuple[Scene | BakedScene, int]
     """Scene and its version: another sky or animation is another light."""
-    guides: Any
-    """``kernels.denoise.Guides`` of the frame."""
-    average: Any
-    """``kernels.denoise.Signals``: averages over frames, and how many."""
+    guides: denoise.Guides
+    """Geometry and colours of the surfaces in the frame's pixels."""
+    average: denoise.Signals
+    """Averages over frames of diffuse and glossy light, and the number of frames in them."""
 
     def leads_to(self, frame: Frame) -> bool:
         """Return whether the frame's motion is towards the last frame, of the same scene and size."""
@@ -90,23 +91,23 @@ class SpatioTemporal(Denoiser):
     wants_lobes: ClassVar[bool] = True
 
     diffuse_radius: int = 12
-    """Pixels to each side. 0 is no filter over pixels."""
+    """Radius in pixels of the filter of diffuse light. 0 is no filter over pixels."""
     diffuse_stride: int = 2
-    """Pixels between taps."""
+    """Distance in pixels between the taps of the filter of diffuse light."""
     diffuse_hysteresis: float = 0.98
     """Weight of the frames before in the average of diffuse light. 0 is no average over frames."""
     glossy_radius: int = 3
-    """Pixels to each side."""
+    """Radius in pixels of the filter of glossy light. 0 is no filter over pixels."""
     glossy_stride: int = 1
-    """Pixels between taps."""
+    """Distance in pixels between the taps of the filter of glossy light."""
     glossy_hysteresis: float = 0.75
     """Weight of the frames before in the average of glossy light."""
     plane_distance: float = 0.02
     """Distance to a pixel's tangent plane that makes another surface, as a share of the distance to the camera."""
     normal_power: float = 8.0
-    """Neighbours weigh this power of the cosine between normals."""
+    """Power of the cosine between two pixels' normals that is a factor of their weight."""
     shrink: float = 1.0 / 3.0
-    """The gaussian over pixels narrows with this power of the samples in the average over frames. 0 keeps it."""
+    """Power of the number of samples averaged over frames by which the filter over pixels narrows. 0 keeps it."""
 
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
@@ -147,7 +148,7 @@ class SpatioTemporal(Denoiser):
         version = (frame.scene, frame.scene.version)
         return History(frame.index, frame.camera.resolution, version, guides, average)
 
-    def _blurred(self, frame: Frame, guides: Any, source: Any) -> Any:
+    def _blurred(self, frame: Frame, guides: denoise.Guides, source: denoise.Signals) -> denoise.Signals:
         """Return signals filtered over pixels."""
         filtered = denoise.Signals()
         filtered.length = source.length
@@ -161,7 +162,7 @@ class SpatioTemporal(Denoiser):
             frame.launch(denoise.filter_neighbourhood, inputs)
         return filtered
 
-    def _temporal_settings(self, frame: Frame) -> Any:
+    def _temporal_settings(self, frame: Frame) -> denoise.TemporalSettings:
         settings = denoise.TemporalSettings()
         settings.width, settings.height = frame.camera.resolution
         settings.diffuse_weight = 1.0 - self.diffuse_hysteresis
@@ -169,7 +170,7 @@ class SpatioTemporal(Denoiser):
         settings.plane_distance = self.plane_distance
         return settings
 
-    def _spatial_settings(self, frame: Frame, kind: str) -> Any:
+    def _spatial_settings(self, frame: Frame, kind: str) -> denoise.SpatialSettings:
         hysteresis = getattr(self, f"{kind}_hysteresis")
         settings = denoise.SpatialSettings()
         settings.width, settings.height = frame.camera.resolution
@@ -183,7 +184,7 @@ class SpatioTemporal(Denoiser):
         return settings
 
     @staticmethod
-    def _signals(frame: Frame) -> Any:
+    def _signals(frame: Frame) -> denoise.Signals:
         width, height = frame.camera.resolution
         signals = denoise.Signals()
         signals.diffuse = wp.empty(width * height, dtype=wp.vec3, device=frame.device)
@@ -201,7 +202,7 @@ class Oidn(Denoiser):
     """
 
     quality: str = "high"
-    """"high", "balanced" or "fast"."""
+    """Quality of Open Image Denoise: "high", "balanced" or "fast"."""
 
     def validate(self) -> None:
         """Raise OptionError for an unknown quality."""
@@ -231,7 +232,7 @@ class Oidn(Denoiser):
 
 
 DENOISERS: dict[str, type[Denoiser]] = {"oidn": Oidn, "spatiotemporal": SpatioTemporal}
-"""What a pipeline's ``denoise`` may name."""
+"""Classes that a pipeline's ``denoise`` may name."""
 
 
 def denoiser_named(name: str) -> Denoiser:

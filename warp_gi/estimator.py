@@ -26,7 +26,7 @@ class Estimator(Stateful):
     """
 
     term: ClassVar[str]
-    """"environment", "emitters" or "indirect"."""
+    """Term of the light that the estimator stands for: "environment", "emitters" or "indirect"."""
 
     def trace(self, frame: Frame, state: Any) -> None:
         """Add this term's samples of the current camera sample to the frame's buffers."""

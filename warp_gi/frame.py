@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -49,9 +49,9 @@ class FrameSettings:
     """Settings of a pipeline that decide how a frame is sampled."""
 
     spp: int
-    """Samples a pixel."""
+    """Number of samples a pixel."""
     camera_samples: int
-    """Camera rays a pixel that the samples are spread over."""
+    """Number of camera rays a pixel that the samples are spread over."""
     filter: str = "box"
     """Pixel filter, "box" or "tent"."""
     wants_lobes: bool = False
@@ -82,22 +82,22 @@ class Frame:
         self.camera, self.previous_camera = camera, previous_camera
         self.index, self.previous_index = index, previous_index
         self.time = frame_time
-        """Seconds from the first frame."""
+        """Time of the frame in seconds from the first one."""
         self.seed = seed
         """Hash of the sequence's seed and the frame's number."""
         self.timings: dict[str, float] = {}
         """Wall seconds by stage; "compile" is kernel compilation, left out of the others."""
         self.metadata: dict[str, str | int | float] = {}
-        """What decides the pixels beside camera and time, by name."""
+        """Values by name that decide the pixels, beside camera and time."""
         self.paths = PathRequest()
-        """What estimators ask of the path tracer."""
+        """Requests of estimators to the path tracer."""
         self.sky_probability = sky_probability(scene)
         """Probability of sampling the sky where a path vertex samples either the sky or an emitter."""
         self._offers: dict[type, Any] = {}
         width, height = camera.resolution
         count = width * height
 
-        def zeros(dtype: Any) -> wp.array:
+        def zeros(dtype: type) -> wp.array:
             return wp.zeros(count, dtype=dtype, device=device)
 
         self._arrays: dict[str, wp.array] = {name: zeros(wp.vec3) for name in _VEC3_BUFFERS}
@@ -137,10 +137,10 @@ class Frame:
         width, height = self.camera.resolution
         return values.reshape(height, width, *values.shape[1:])
 
-    def struct(self, struct: Any) -> Any:
+    def struct(self, struct: type[launch.Struct]) -> launch.Struct:
         """Return a kernel struct whose fields are the buffers of the same names."""
         filled = struct()
-        for name in struct.vars:
+        for name in launch.fields_of(struct):
             setattr(filled, name, self._arrays.get(name))
         return filled
 
@@ -202,7 +202,7 @@ class Frame:
 
     # ---- launches ----
 
-    def launch(self, kernel: wp.Kernel, inputs: list[Any], count: int | None = None) -> None:
+    def launch(self, kernel: wp.Kernel, inputs: Sequence[object], count: int | None = None) -> None:
         """Run a kernel over ``count`` items, or over every pixel."""
         width, height = self.camera.resolution
         launch.launch(kernel, width * height if count is None else count, inputs, self.device)
@@ -213,7 +213,7 @@ class Frame:
         tiles = [math.ceil(size / gbuffer.TILE) for size in self.camera.resolution]
         return tiles[0] * tiles[1] * gbuffer.TILE**2
 
-    def launch_tiled(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
+    def launch_tiled(self, kernel: wp.Kernel, inputs: Sequence[object]) -> None:
         """Run a kernel over every pixel in tiles (``kernels.gbuffer.tiled_pixel``)."""
         self.launch(kernel, inputs, self.tiled_items)
 

@@ -17,14 +17,17 @@ import os
 import threading
 import time
 import weakref
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 import warp as wp
 
 from warp_gi import forks, workers
 from warp_gi.errors import OptionError
+
+Struct = TypeVar("Struct")
+"""Class of a kernel struct."""
 
 SLICES_PER_THREAD = 16  # enough to balance uneven work, few enough that 30 us a launch vanish
 SMALLEST_SLICE = 256  # items
@@ -33,9 +36,10 @@ CUDA_BLOCK = 256  # threads
 _loading = threading.RLock()  # taken across a fork, so that no thread that only the parent has is inside the compiler
 _threads: int | None = None
 compile_seconds = 0.0
-"""Wall seconds this process has spent compiling or loading kernel modules."""
+"""Wall seconds that this process has spent compiling or loading kernel modules."""
 compile_cpu_seconds = 0.0
-"""CPU seconds of the same; fewer where other processes wanted the cores."""
+"""CPU seconds that this process has spent compiling or loading kernel modules; fewer than wall seconds where other
+processes wanted the cores."""
 on_load: Callable[[str], None] | None = None
 """Called with a kernel module's name before its first launch, which may take seconds to compile; for progress."""
 _loaded: set[tuple[str, str]] = set()
@@ -99,7 +103,7 @@ def check_fork(device: wp.Device) -> None:
         )
 
 
-def on_device(values: np.ndarray, dtype: Any, device: wp.Device) -> wp.array:
+def on_device(values: np.ndarray, dtype: type, device: wp.Device) -> wp.array:
     """Return ``values`` as an array of ``dtype`` on a device; on the CPU it is the same memory.
 
     NumPy asks for huge pages where an array is large (4 MB), which halves the cost of random access; Warp's
@@ -108,10 +112,15 @@ def on_device(values: np.ndarray, dtype: Any, device: wp.Device) -> wp.array:
     return wp.array(values, dtype=dtype, device=device, copy=not device.is_cpu)
 
 
-def copied(source: Any, struct: Any) -> Any:
+def fields_of(struct: Any) -> Iterable[str]:
+    """Return the names of a kernel struct's fields."""
+    return struct.vars
+
+
+def copied(source: Struct, struct: type[Struct]) -> Struct:
     """Return a copy of a kernel struct that shares its arrays."""
     copy = struct()
-    for name in struct.vars:
+    for name in fields_of(struct):
         setattr(copy, name, getattr(source, name))
     return copy
 

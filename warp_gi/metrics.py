@@ -9,25 +9,34 @@ value is NaN or infinite, or when an input is no image.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from warp_gi.color import LUMINANCE, decode_srgb
 from warp_gi.errors import OptionError, one_line
 
+
+class Image(Protocol):
+    """An array that says what is in it: of NumPy, Warp, PyTorch, JAX or another library."""
+
+    def __dlpack__(self) -> Any:
+        """Return the memory as a DLPack capsule."""
+        ...
+
+
 RELATIVE_EPSILON = 1e-2
 PIXELS_PER_DEGREE = 67.02064
-"""FLIP's default viewer: 0.7 m from a 0.7 m wide 3840-pixel screen."""
+"""Pixels a degree of FLIP's default viewer: 0.7 m from a 0.7 m wide screen of 3840 pixels."""
 
 
-def rmse(image: Any, reference: Any) -> float:
+def rmse(image: Image, reference: Image) -> float:
     """Return the root of the mean squared difference over pixels and channels."""
     a, r = _pair(image, reference)
     return math.sqrt(np.mean((a - r) ** 2))
 
 
-def psnr(image: Any, reference: Any, peak: float = 1.0) -> float:
+def psnr(image: Image, reference: Image, peak: float = 1.0) -> float:
     """Return the peak signal-to-noise ratio, 10 log10(peak^2 / MSE), in dB; inf for equal images."""
     if not peak > 0:
         raise OptionError(f"psnr: peak must be above 0, got {peak}")
@@ -35,7 +44,7 @@ def psnr(image: Any, reference: Any, peak: float = 1.0) -> float:
     return math.inf if error == 0 else 20 * math.log10(peak / error)
 
 
-def rel_mse(image: Any, reference: Any, epsilon: float = RELATIVE_EPSILON) -> float:
+def rel_mse(image: Image, reference: Image, epsilon: float = RELATIVE_EPSILON) -> float:
     """Return the mean of (image - reference)^2 / (reference^2 + epsilon) over pixels and channels.
 
     The convention of Rousselle et al. 2011, "Adaptive Sampling and Reconstruction using Greedy Error
@@ -47,13 +56,15 @@ def rel_mse(image: Any, reference: Any, epsilon: float = RELATIVE_EPSILON) -> fl
     return float(np.mean((a - r) ** 2 / (r**2 + epsilon)))
 
 
-def flip(image: Any, reference: Any, hdr: bool | None = None, pixels_per_degree: float = PIXELS_PER_DEGREE) -> float:
+def flip(
+    image: Image, reference: Image, hdr: bool | None = None, pixels_per_degree: float = PIXELS_PER_DEGREE
+) -> float:
     """Return the mean of ``flip_map``: 0 for images that look the same, at most 1."""
     return float(np.mean(flip_map(image, reference, hdr, pixels_per_degree), dtype=np.float64))
 
 
 def flip_map(
-    image: Any, reference: Any, hdr: bool | None = None, pixels_per_degree: float = PIXELS_PER_DEGREE
+    image: Image, reference: Image, hdr: bool | None = None, pixels_per_degree: float = PIXELS_PER_DEGREE
 ) -> np.ndarray:
     """Return the FLIP difference of each pixel as seen when alternating the images, float32 [height, width], 0..1.
 
@@ -107,7 +118,7 @@ def _exposure_range(reference: np.ndarray) -> tuple[float, float]:
     return math.log2(x / luminance.max()), math.log2(x / median)
 
 
-def _linear_rgb(image: Any) -> np.ndarray:
+def _linear_rgb(image: Image) -> np.ndarray:
     array = _array(image)
     is_coded = np.issubdtype(array.dtype, np.integer)
     values = _float(array)
@@ -120,7 +131,7 @@ def _linear_rgb(image: Any) -> np.ndarray:
     return decode_srgb(values) if is_coded else values
 
 
-def _pair(image: Any, reference: Any) -> tuple[np.ndarray, np.ndarray]:
+def _pair(image: Image, reference: Image) -> tuple[np.ndarray, np.ndarray]:
     a, r = _float(_array(image)), _float(_array(reference))
     _check_pair(a, r)
     return a, r
@@ -140,17 +151,18 @@ def _size(array: np.ndarray) -> str:
     return f"{array.shape[1]}x{array.shape[0]} with {channels} channel{'s' * (channels != 1)}"
 
 
-def _array(image: Any) -> np.ndarray:
-    if not isinstance(image, np.ndarray):
+def _array(image: Image) -> np.ndarray:
+    given: Any = image
+    if not isinstance(given, np.ndarray):
         import warp as wp
 
-        if not isinstance(image, wp.array) and hasattr(image, "__dlpack__"):
-            image = wp.from_dlpack(image)
-        if isinstance(image, wp.array):
-            image = image.numpy()
-            if image.ndim == 3 and image.shape[2] == 1:
-                image = image[:, :, 0]
-    array = np.asarray(image)
+        if not isinstance(given, wp.array) and hasattr(given, "__dlpack__"):
+            given = wp.from_dlpack(given)
+        if isinstance(given, wp.array):
+            given = given.numpy()
+            if given.ndim == 3 and given.shape[2] == 1:
+                given = given[:, :, 0]
+    array = np.asarray(given)
     if array.ndim not in (2, 3) or array.size == 0 or array.dtype.kind not in "fiu":
         raise OptionError(
             f"expected an image [height, width] or [height, width, channels], got {array.dtype} {array.shape}"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import warp as wp
 
@@ -22,11 +23,17 @@ TERM_BITS = {
 }
 
 
-class SamplerInUse(NamedTuple):
-    """A tuple of functions of ``kernels.path_samplers``, and the struct of data that they get in this frame."""
+Sampler = TypeVar("Sampler", bound=NamedTuple)
 
-    sampler: Any
+
+@dataclass(frozen=True, eq=False)
+class SamplerInUse(Generic[Sampler]):
+    """Functions that paths call, and the data that these functions get in this frame."""
+
+    sampler: Sampler
+    """Tuple of functions, one of those in ``kernels.path_samplers``."""
     data: Any
+    """Kernel struct of the class that ``sampler.data`` names."""
 
 
 class PathRequest:
@@ -42,19 +49,22 @@ class PathRequest:
         self.regions = SamplerInUse(path_samplers.NO_REGIONS, path_samplers.NoRegions())
         """Regions of space that samplers tell apart. Set by ``prepare``, if a sampler uses regions."""
         self.sky = SamplerInUse(path_samplers.SCENE_SKY, path_samplers.SceneSky())
-        """What paths meet where they leave the scene."""
+        """Sky that paths meet where they leave the scene."""
         self.cache = SamplerInUse(path_samplers.NO_CACHE, path_samplers.NoCache())
         """Radiance cache that paths may end in."""
         self.cache_vertex = int(path_trace.CACHE_VERTEX)
-        """Vertex from which on they may: 1 is the first hit."""
+        """First vertex at which paths may end in the radiance cache; 1 is the first hit."""
         self.table: wp.array | None = None
         """Alias table over emitters, AliasBucket [emitter]; None is that of the scene, by power."""
         self.terms = 0
         """Bits of the terms that this camera sample's estimators want, ``path_trace.TERM_*``."""
         self.max_depth = 2
+        """Edges of the longest path from the camera to a light; 2 is direct light."""
         self.roulette_depth = 5
+        """Number of edges from which on paths end at random."""
         self.clamp = 0.0
-        self._regions: tuple[Any, Callable[[PathRequest], Any]] | None = None
+        """Largest component of a path's indirect radiance, W/(m^2 sr); 0 is no limit."""
+        self._regions: tuple[path_samplers.Regions, Callable[[PathRequest], Any]] | None = None
 
     # ---- requests ----
 
@@ -106,10 +116,18 @@ class PathRequest:
         """Whether an estimator asked for a term in this camera sample."""
         return self.terms != 0
 
-    def samplers(self) -> tuple[Any, ...]:
+    def samplers(
+        self,
+    ) -> tuple[
+        path_samplers.LightSampler,
+        path_samplers.DirectionSampler,
+        path_samplers.Regions,
+        path_samplers.Sky,
+        path_samplers.PathCache,
+    ]:
         """Return the arguments of ``kernels.path_trace.path_tracer``."""
-        used = self.lights, self.directions, self.regions, self.sky, self.cache
-        return tuple(one.sampler for one in used)
+        lights, directions, regions = self.lights.sampler, self.directions.sampler, self.regions.sampler
+        return lights, directions, regions, self.sky.sampler, self.cache.sampler
 
     def begin(self) -> None:
         """Forget the terms of the last camera sample."""

@@ -40,20 +40,21 @@ class Pipeline:
     """
 
     environment: Estimator | None = _made("TracedEnvironment")
-    """Direct light from the sky."""
+    """Estimator of direct light from the sky."""
     emitters: Estimator | None = _made("PowerLights")
-    """Direct light from emissive triangles and punctual lights."""
+    """Estimator of direct light from emissive triangles and punctual lights."""
     indirect: Estimator | None = _made("BsdfPaths")
-    """Light that arrives over other surfaces."""
+    """Estimator of light that arrives over other surfaces."""
     spp: int = 16
-    """Samples a pixel."""
+    """Number of samples a pixel."""
     camera_samples: int | None = None
-    """Distinct jittered camera rays a pixel that the samples are spread over; None is 4, or spp if that is
+    """Number of distinct jittered camera rays a pixel that the samples are spread over; None is 4, or spp if that is
     less. 1 gives pixel centres, spp one a sample as a reference wants."""
     filter: str = "box"
     """Pixel filter: "box" or "tent" (two pixels wide)."""
     denoise: Denoiser | None = None
-    """What makes the beauty of the noisy terms, or its name: "spatiotemporal", "oidn". The terms stay noisy."""
+    """Denoiser that makes the beauty of the noisy terms, or its name: "spatiotemporal", "oidn". The terms stay
+    noisy."""
 
     octree: Service = _made("SampleOctree")
     """Octree of regions shared by the techniques that learn (``VisibilityLightCache``, ``GuidedPaths``)."""

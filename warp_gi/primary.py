@@ -17,7 +17,7 @@ class Primary(Stateful):
     """Base of what finds the points that a frame shows: fills ``Frame.hits`` and the surface buffers."""
 
     is_whole: ClassVar[bool] = False
-    """Whether it fills the buffers of light, too. Then no estimator traces, and no path."""
+    """Whether it fills the buffers of light, too. Then no estimator is asked, and no path is traced."""
 
     def trace(self, frame: Frame, state: Any) -> None:
         """Find the primary hits of the current camera sample, and fill the buffers of surfaces."""

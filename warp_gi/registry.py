@@ -25,9 +25,9 @@ class Claim:
     unbiased: bool = True
     """Whether the mean over seeds is exact; a z-test checks it."""
     bound: float = 0.0
-    """For a biased one: largest relative error of a picture's mean."""
+    """Largest relative error of a picture's mean, for an estimator that is not unbiased."""
     resolution: tuple[Mapping[str, Any], ...] = ()
-    """For a biased one: settings from coarse to fine, along which the error falls."""
+    """Settings from coarse to fine, along which the error of an estimator that is not unbiased falls."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class Entry:
     """Where a class of a technique lies, and what it claims."""
 
     module: str
-    """Module that defines the class, below the technique's folder."""
+    """Name of the module that defines the class, relative to the technique's folder."""
     claims: Mapping[str, Claim] = field(default_factory=lambda: {"": Claim()})
-    """Claims by variant; "" is that of the default settings."""
+    """Claims by variant; "" is the claim of the default settings."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,9 @@ class Technique:
     """One technique, by names alone."""
 
     name: str
-    """Long name, as in ``--technique``: "visibility-field"."""
+    """Long name of the technique, as in ``--technique``: "visibility-field"."""
     short: str
-    """Short name: of its preset, its suite and the suffix of its bakes: "dvf"."""
+    """Short name, for its preset, its suite and the suffix of its bakes: "dvf"."""
     estimators: Mapping[str, Entry] = field(default_factory=dict)
     """Estimators by class name."""
     services: Mapping[str, Entry] = field(default_factory=dict)
@@ -64,9 +64,9 @@ class Technique:
     bake_tool: str = ""
     """Module below the folder with ``TOOL``, by which ``warp-gi bake`` bakes it; "" if it has none."""
     suite: str = ""
-    """Benchmark suite."""
+    """Name of the benchmark suite; "" if it has none."""
     page: str = ""
-    """Page of the documentation, below docs/."""
+    """Page of the documentation, relative to docs/."""
 
 
 @cache

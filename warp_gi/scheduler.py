@@ -13,7 +13,7 @@ import numpy as np
 
 import warp_gi
 from warp_gi import launch
-from warp_gi.baking import Bake, load_bake
+from warp_gi.baking import Bake, Setting, load_bake
 from warp_gi.denoise import Denoiser
 from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.frame import Frame
@@ -291,8 +291,8 @@ class FrameScheduler:
 
     def _saved_state(self, lineage: str, arrays: dict[str, np.ndarray]) -> Bake:
         """Return a file's contents; the sky may differ from that of the frame before."""
-        settings = {key: str(value) for key, value in self.metadata().items() if key != "scene_hash"}
-        settings |= {"lineage": lineage}
+        settings: dict[str, Setting] = {"lineage": lineage}
+        settings |= {key: str(value) for key, value in self.metadata().items() if key != "scene_hash"}
         return Bake("FrameScheduler", self.scene.contents_hash, settings, arrays, scene_name=self.scene.name)
 
 

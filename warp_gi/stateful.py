@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from warp_gi.baking import Bake
+    from warp_gi.baking import Bake, Setting
     from warp_gi.frame import Frame
     from warp_gi.scene.baked import BakedScene
     from warp_gi.scene.camera import Camera, CameraPath
@@ -19,7 +19,7 @@ class Ahead:
     """What is known of a sequence before its first frame."""
 
     state: Any
-    """State before the first frame of whom the question is asked."""
+    """State before the first frame, of the part that the question is about."""
     views: Sequence[tuple[int, Camera]]
     """Number and camera of each frame that will be rendered."""
     sky_changes: bool = False
@@ -51,7 +51,7 @@ class Stateful:
         """
         return ""
 
-    def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Any]:
+    def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Setting]:
         """Return the settings that a bake depends on."""
         return {}
 

@@ -21,9 +21,9 @@ class Slices:
 
     def __init__(self, run: Callable[[int], None], count: int) -> None:
         self.error: BaseException | None = None
-        """What the first failed slice on a worker raised."""
+        """Exception of the first slice that failed on a worker, or None."""
         self.is_lost = False
-        """Whether this is the copy of a forked process, and workers that it does not have were in some slices."""
+        """Whether a fork copied this job, so that some of its slices were on workers that the copy does not have."""
         self._run = run
         self._next, self._count = 0, count
         self._workers = 0  # that are in slices

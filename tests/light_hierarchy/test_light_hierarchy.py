@@ -18,14 +18,8 @@ from warp_gi.kernels import types
 from warp_gi.launch import launch
 from warp_gi.scene.model import Material, Mesh, Node, PunctualLight
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.light_hierarchy.tree import (
-    EmitterBounds,
-    TreeArrays,
-    build_tree,
-    emitter_bounds,
-    refit_tree,
-    to_device,
-)
+from warp_gi.techniques.light_hierarchy.bounds import EmitterBounds, emitter_bounds
+from warp_gi.techniques.light_hierarchy.tree import TreeArrays, build_tree, refit_tree, to_device
 
 wp.set_module_options({"enable_backward": False})
 

@@ -285,7 +285,7 @@ def test_what_a_cell_gets_does_not_depend_on_the_pose_in_which_baking_began():
         scene.animate("plate", [gi.Keyframe(0.0, scale=(1.0, 1.0, 1.0)), gi.Keyframe(0.5, scale=(3.0, 3.0, 3.0))])
         scene.update(time, None, st.device())
         state = FIELD.start(scene, st.device().alias, None)
-        densities.append([state.baker(layer).density for layer in ("lasting", "at rest")])
+        densities.append([state.baker(layer).density for layer in ("static", "settled")])
     assert densities[0] == densities[1] and densities[0][0] == densities[0][1] > 0
 
 

@@ -50,25 +50,25 @@ class BakeOptions(SceneOptions):
     """What to bake, and how."""
 
     environment: Annotated[str, flag("SKY", "the scene's own")] = ""
-    """The sky, as in render. What is baked holds its light, or only its pictures do: see above."""
+    """Sky of the scene, as in render. A bake may hold its light, or only the pictures show it; see above."""
     technique: Annotated[str, flag("NAME", DEFAULT_TECHNIQUE)] = DEFAULT_TECHNIQUE
-    """What to bake for, by its long or short name: see above. Its settings are the flags below."""
+    """Technique to bake for, by its long or short name; see above. The flags below are its settings."""
     everywhere: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Bake all of the scene, where a technique otherwise bakes what the camera path sees."""
     picture: Annotated[str, flag("WxH", "the camera's own")] = ""
-    """Width and height in pixels at which the camera sees, render's --resolution."""
+    """Width and height in pixels of the camera's picture, as 960x540; render's --resolution."""
     seed: int = 1
-    """Every random number follows from it."""
+    """Seed that every random number follows from."""
     device: str = "cpu"
-    """cpu, cuda or cuda:1."""
+    """Device to compute on: cpu, cuda or cuda:1."""
     threads: Annotated[int | None, flag("N", "every core")] = None
-    """Threads on the CPU. The bake does not depend on it."""
+    """Number of threads on the CPU. The bake does not depend on it."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE", help_behavior_hint="")] = None
-    """Where the bake goes (default: out/NAME.SHORT.safetensors, with the short name of the technique)."""
+    """File of the bake (default: out/NAME.SHORT.safetensors, with the short name of the technique)."""
     show: Annotated[Path | None, flag("FOLDER", "none")] = None
-    """Write pictures of the bake; above is what they show."""
+    """Folder for pictures of the bake; they are described above."""
     export: Annotated[Path | None, flag("FILE", "none")] = None
-    """Write the bake as textures for other programs, and a .json that says how to read them; above is which files."""
+    """File for the bake as textures for other programs, beside a .json that says how to read them; see above."""
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print nothing but errors."""
     settings: Annotated[Estimator, tyro.conf.arg(name="")] = field(

@@ -30,25 +30,26 @@ class Bench:
     """
 
     suite: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SUITE", help_behavior_hint="")] = ""
-    """One that warp-gi bench lists, or all."""
+    """Name of a suite that warp-gi bench lists, or all."""
     parts: Annotated[tuple[str, ...], flag("NAME...", "all of them")] = ()
-    """Parts of the suite to run; a wrong name tells which there are."""
+    """Names of parts of the suite to run; a wrong name tells which there are."""
     quick: bool = False
-    """Smaller inputs, for a first look; not for figures that anyone quotes."""
+    """Run smaller inputs, for a first look. Do not quote figures from them."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
-    """Also write each row as a line of JSON, with commit, versions, processor and settings; - prints the lines."""
+    """File for the rows, a line of JSON each, with commit, versions, processor and settings; - prints the lines."""
     html: Annotated[Path | None, flag("FILE", "none")] = None
-    """Also write tables, plots and the pictures that suites compare as one HTML file that needs no network."""
+    """File for tables, plots and the pictures that suites compare: one HTML file that needs no network."""
     report: Annotated[tuple[Path, ...], flag("RESULTS...", "none")] = ()
     """Results files that --json wrote, to make the --html report of."""
     diff: Annotated[tuple[Path, Path] | None, flag("OLD NEW", "none")] = None
-    """Two results files: print what became worse or better beyond the spread. Exit code 1 if anything is worse."""
+    """Two results files to compare: prints what became worse or better beyond the spread. Exit code 1 if anything
+    is worse."""
     tolerance: Annotated[float | None, flag("SHARE", "0.15 for times, 0.05 for errors")] = None
-    """For --diff: the share that values may change by where their spread is not known."""
+    """Share by which --diff lets values change whose spread is not known."""
     device: str = "cpu"
-    """cpu, cuda or cuda:1."""
+    """Device to compute on: cpu, cuda or cuda:1."""
     threads: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: every core)")] = None
-    """Threads on the CPU."""
+    """Number of threads on the CPU."""
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -28,19 +28,19 @@ class Compare:
     """
 
     image: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE")]
-    """The picture in question."""
+    """File of the picture to judge."""
     reference: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="REFERENCE")]
-    """What it should be."""
+    """File of the picture as it should be."""
     layer: str = "beauty"
-    """Layer of EXR files, for example indirect or albedo."""
+    """Layer of EXR files to compare, for example indirect or albedo."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = Path("difference.png")
-    """PNG: image, reference and FLIP side by side. EXR: image minus reference."""
+    """File for the difference. PNG: image, reference and FLIP side by side. EXR: image minus reference."""
     epsilon: float = metrics.RELATIVE_EPSILON
-    """Of relMSE, the mean of (image - reference)^2 / (reference^2 + epsilon)."""
+    """Number added below the line of relMSE, the mean of (image - reference)^2 / (reference^2 + epsilon)."""
     peak: float = 1.0
-    """Of PSNR: the value that counts as full signal."""
+    """Value that counts as full signal in PSNR."""
     exposure: float = 0.0
-    """Of the pictures in the PNG, in stops."""
+    """Exposure of the pictures in the PNG, in stops."""
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -47,29 +47,30 @@ class CompareBench(SceneOptions):
     scene: Annotated[str, flag("SCENE", DEFAULT_SCENE)] = ""
     """A GLB, glTF, OBJ or PLY file, or the name of a built-in scene."""
     frame: int = 0
-    """Which frame of a camera path, and of what moves."""
+    """Number of the frame, of a camera path and of what moves."""
     size: Annotated[str, flag("WxH", f"the reference's, else {SIZE}", "--resolution")] = ""
-    """Width and height in pixels."""
+    """Width and height of the pictures in pixels."""
     pipelines: Annotated[str, flag("NAMES", "path,dvf,hybrid")] = "path,dvf,hybrid"
-    """Presets, as in warp-gi render --pipeline: path,dvf,environment=none are two. Times are relative to the first."""
+    """Presets to compare, as in warp-gi render --pipeline; path,dvf,environment=none are two. Times are relative
+    to the first."""
     time: Annotated[str, flag("TIME", "30s")] = "30s"
-    """How long each pipeline may render, as 30s or 2m; setup and compilation are apart."""
+    """Time that each pipeline may render, as 30s or 2m; setup and compilation are apart."""
     spp: int = 4
-    """Samples a pixel of a frame. 1 looks through the middles of pixels only."""
+    """Samples a pixel of each frame. 1 looks through the middles of pixels only."""
     reference: Annotated[Path | None, flag("FILE", "computed by the path tracer")] = None
-    """What the picture should be: EXR, HDR or NPY of linear radiance."""
+    """File of the picture as it should be: EXR, HDR or NPY of linear radiance."""
     reference_spp: Annotated[int, flag("N", "1024")] = 1024
-    """Samples a pixel of a computed reference."""
+    """Samples a pixel of a reference that is computed."""
     html: Annotated[Path | None, flag("FILE", "none")] = None
-    """Write tables, plots and pictures as one HTML file that needs no network."""
+    """File for tables, plots and pictures: one HTML file that needs no network."""
     json: Annotated[Path | None, flag("FILE", "none")] = None
-    """Write each row as a line of JSON; - prints the lines."""
+    """File for the rows, a line of JSON each; - prints the lines."""
     device: str = "cpu"
-    """cpu, cuda or cuda:1."""
+    """Device to compute on: cpu, cuda or cuda:1."""
     threads: Annotated[int | None, flag("N", "every core")] = None
-    """Threads on the CPU."""
+    """Number of threads on the CPU."""
     seed: int = 1
-    """Every random number follows from it."""
+    """Seed that every random number follows from."""
 
 
 @dataclass(frozen=True)

@@ -34,24 +34,24 @@ class SceneOptions:
     scene: Annotated[str, tyro.conf.Positional, flag("[SCENE]", DEFAULT_SCENE)] = ""
     """A GLB, glTF, OBJ or PLY file, or the name of a built-in scene."""
     smooth: Annotated[float | None, flag("DEGREES", "flat, as glTF asks")] = None
-    """Smooth normals for meshes of a file that have none, except across edges that bend more than this."""
+    """Crease angle in degrees: meshes of a file without normals get smooth ones, except across edges that bend more."""
     scale: float = 1.0
-    """Metres in one unit of the file."""
+    """Length in metres of one unit of the file."""
     environment: Annotated[str, flag("SKY", "the scene's own; files: none")] = ""
-    """The sky: a latitude-longitude EXR or HDR file, a radiance R,G,B, sun-sky, or none."""
+    """Sky of the scene: a latitude-longitude EXR or HDR file, a radiance R,G,B, sun-sky, or none."""
     environment_rotation: float = 0.0
-    """Turns the sky about +y, degrees, counter-clockwise seen from above."""
+    """Angle in degrees by which the sky is turned about +y, counter-clockwise seen from above."""
     environment_scale: float = 1.0
-    """Multiplies the sky's radiance."""
+    """Factor on the sky's radiance."""
     sun: SunSky = field(default_factory=SunSky)
     camera: Annotated[str, flag("PATH", "the built-in path, the file's first camera, or one that sees all")] = ""
-    """A camera path in JSON, the name of a camera in the scene, or of a built-in scene whose path to take."""
+    """Camera path in JSON, name of a camera in the scene, or name of a built-in scene whose path to take."""
     eye: Annotated[tuple[float, float, float] | None, flag("X Y Z", "use --camera")] = None
-    """Where a still camera stands, metres."""
+    """Position of a still camera in metres."""
     target: Annotated[tuple[float, float, float] | None, flag("X Y Z", "use --camera")] = None
-    """What it looks at."""
+    """Point in metres that a still camera looks at."""
     hfov: Annotated[float | None, flag("DEGREES", "the camera's own; 65 with --eye")] = None
-    """Horizontal field of view of a still camera."""
+    """Horizontal field of view of a still camera in degrees."""
 
 
 def open_scene(name: str, smooth: float | None = None, scale: float = 1.0) -> Scene:

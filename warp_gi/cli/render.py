@@ -62,36 +62,36 @@ class Render(SceneOptions):
     pipeline: Annotated[str, flag("NAME", "path; probe_view for a bake alone")] = ""
     """Preset, with estimators exchanged after commas: path,indirect=none. Its settings are the flags below."""
     denoise: Annotated[str, flag("NAME", "as the pipeline says: none")] = ""
-    """none, oidn or spatiotemporal, whose settings are then flags below."""
+    """Denoiser: none, oidn or spatiotemporal. Its settings are then flags below."""
     bake: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction, flag("FILE", "none; may be given more than once")] = ()
-    """What warp-gi bake saved, for an estimator of the pipeline with the same settings."""
+    """File that warp-gi bake saved, for an estimator of the pipeline with the same settings."""
     environment_turn: float = 0.0
-    """Degrees by which the sky turns from frame to frame, as --environment-rotation does."""
+    """Angle in degrees by which the sky turns from frame to frame, as --environment-rotation does."""
     frames: Annotated[str, flag("LIST", "every frame of the path; 0 for a still camera")] = ""
-    """Frame numbers: 5, 0-47, 0-47:2 or 1,4,9-12."""
+    """Numbers of the frames to render: 5, 0-47, 0-47:2 or 1,4,9-12."""
     resolution: Annotated[str, flag("WxH", "the camera's own")] = ""
-    """Width and height in pixels, as 960x540."""
+    """Width and height of the frames in pixels, as 960x540."""
     seed: int = 1
-    """Every random number follows from it, the frame, the pixel and the sample."""
+    """Seed that every random number follows from, with the frame, the pixel and the sample."""
     device: str = "cpu"
-    """cpu, cuda or cuda:1."""
+    """Device to compute on: cpu, cuda or cuda:1."""
     threads: Annotated[int | None, flag("N", "every core")] = None
-    """Threads on the CPU. The pictures do not depend on it."""
+    """Number of threads on the CPU. The pictures do not depend on it."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = Path("out/shot.####.exr")
-    """Where frames go; #### becomes the frame's number."""
+    """Name of the frames' files; #### becomes the frame's number."""
     precision: Literal["half", "float"] = "half"
-    """Of colours and normals in EXR files; positions, depth, motion, ids and variance are float always."""
+    """Storage of colours and normals in EXR files. Positions, depth, motion, ids and variance are always float."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Keep frames that are whole and were made with just these settings; render the others."""
     preview: Annotated[bool, tyro.conf.arg(help_behavior_hint="(default: on without SCENE, else off)")] = False
     """Write a tone-mapped PNG beside each frame."""
     exposure: float = 0.0
-    """Of previews, in stops."""
+    """Exposure of previews in stops."""
     reuse_pictures: Annotated[Path | None, flag("FOLDER", "none")] = None
     """Write pictures of what the last frame's samples taught: the octree's leaves, samples and lights in them, shares
     of exploration and of the BSDF. The pipeline has to learn, as reuse and hybrid do."""
     reuse_pixel: Annotated[tuple[int, int] | None, flag("X Y", "none")] = None
-    """Add the quadtree of what this pixel sees, beside the light that comes there. 0 0 is at the top left."""
+    """Pixel x y whose quadtree to draw, beside the light that comes to the point seen there. 0 0 is at the top left."""
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print nothing but errors."""
     verbose: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False

@@ -156,7 +156,7 @@ class Reporter:
     def _begin_frame(self) -> None:
         self._frame_started, self._compiled = time.perf_counter(), launch.compile_seconds
 
-    def table(self, title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    def table(self, title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
         """Print a table; numbers are set to the right."""
         if not self.quiet:
             print_table(title, columns, rows)
@@ -173,7 +173,9 @@ class _Lines(logging.Handler):
         self.reporter.line(record.getMessage())
 
 
-def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]], names: Sequence[int] = (0,)) -> None:
+def print_table(
+    title: str, columns: Sequence[str], rows: Iterable[Sequence[object]], names: Sequence[int] = (0,)
+) -> None:
     """Print a table on standard output, plain enough for a log file.
 
     One that is wider than the terminal, or than ``LOG_WIDTH`` elsewhere, is parted, so that no number is broken; each
@@ -183,8 +185,8 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]
     from rich.console import Console
     from rich.table import Table
 
-    rows = [[cell_text(value) for value in row] for row in rows]
-    cells = [[row[index] for row in rows] for index in range(len(columns))]
+    texts = [[cell_text(value) for value in row] for row in rows]
+    cells = [[row[index] for row in texts] for index in range(len(columns))]
     numeric = [any(map(_is_number, column)) for column in cells]
     widths = [_least_width(*one) for one in zip(columns, cells, numeric, strict=True)]
     console = Console(width=None if sys.stdout.isatty() else LOG_WIDTH, markup=False, highlight=False, emoji=False)
@@ -197,7 +199,7 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]
             room -= more
             justify: Literal["left", "right"] = "right" if numeric[index] else "left"
             table.add_column(columns[index], justify=justify, overflow="fold", width=widths[index] + more)
-        for row in rows:
+        for row in texts:
             table.add_row(*(row[index] for index in part))
         with console.capture() as printed:
             console.print(table)
@@ -284,7 +286,7 @@ def _keep_heap_whole() -> None:
         mallopt(_M_MMAP_THRESHOLD, _LARGE_BLOCK)
 
 
-def cell_text(value: Any) -> str:
+def cell_text(value: object) -> str:
     """Return a value as tables show it: four digits, thousands parted, None as nothing."""
     if isinstance(value, bool):
         return "yes" if value else "no"

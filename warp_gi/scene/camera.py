@@ -30,12 +30,12 @@ class CameraKey:
     """A camera pose at a time."""
 
     time: float
-    """Seconds."""
+    """Time of the key in seconds."""
     eye: Vec3
     target: Vec3
     up: Vec3 = (0.0, 1.0, 0.0)
     hfov: float = 65.0
-    """Degrees."""
+    """Horizontal field of view in degrees."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class CameraPath:
 
     keys: tuple[CameraKey, ...]
     fps: float = 24.0
-    """Frames a second: frame i is at time ``i / fps``."""
+    """Frames per second: frame i is at time ``i / fps``."""
     resolution: tuple[int, int] = (960, 540)
     name: str = field(default="", compare=False)
 

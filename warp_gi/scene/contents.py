@@ -22,9 +22,9 @@ class SceneContents(Protocol):
     lights: list[PunctualLight]
     materials: list[Material]
     _flat: FlatGeometry
-    """Copy of the geometry of all nodes, at time 0."""
+    """Copy of the geometry of all nodes at time 0, in world space."""
     _emissive: np.ndarray
-    """Indices of the triangles that emit."""
+    """Indices of the triangles that emit, int64 [emissive triangle]."""
     _moving: list[bool]
     """Whether each node moves, by its index."""
     _world: list[np.ndarray]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -93,7 +93,7 @@ class DeviceScene:
             self._resting_bvh = TriangleBvh(self.flat.points, self.flat.indices[rests], self.device.alias, masks)
         return self._resting_bvh
 
-    def _array(self, values: np.ndarray, dtype: Any) -> wp.array:
+    def _array(self, values: np.ndarray, dtype: type) -> wp.array:
         return on_device(values, dtype, self.device)
 
     def placed_emitters(self) -> emitters.PlacedEmitters:

@@ -9,21 +9,26 @@ nodes under them, and all lights if one of them moves.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
 from warp_gi.errors import SceneError
 from warp_gi.scene import animation, emitters, geometry, textures
 from warp_gi.scene.model import Material, Mesh, Node, PunctualLight, Texture
-from warp_gi.scene.watching import Change, Watch
+from warp_gi.scene.watching import Change, Owner, Watch
 
 if TYPE_CHECKING:
+    from warp_gi.kernels import types
     from warp_gi.scene.contents import SceneContents
+    from warp_gi.scene.environment import SkyMap
 
 NEW_SCENE = "make a new scene: gi.Scene(scene.nodes, scene.lights, scene.environment, scene.cameras)"
 NEW_SKY = "assign it again: scene.environment = ..."
+
+
+Item = TypeVar("Item", Material, Mesh, Node, PunctualLight)
 
 
 class Edit(NamedTuple):
@@ -40,7 +45,7 @@ class _Slot(NamedTuple):
     vertices: slice
     triangles: slice
     row: int
-    """Of its material in ``Scene.materials``."""
+    """Index of the mesh's material in ``Scene.materials``."""
 
 
 class Edits:
@@ -57,7 +62,7 @@ class Edits:
         self.light_world: list[np.ndarray] = []
         self.light_list: list[PunctualLight] = []
         self.sky_watch: Watch | None = None
-        self.sky_map: Any = None
+        self.sky_map: SkyMap | None = None
 
     def in_use(self) -> None:
         """Watch everything from now on: a device holds all that the scene is made of."""
@@ -291,13 +296,13 @@ class Edits:
         return None
 
 
-def _geometry(scene: SceneContents) -> list[Any]:
+def _geometry(scene: SceneContents) -> list[Owner]:
     """Return what the flat geometry of a scene is made from."""
     meshes = {id(mesh): mesh for node in scene.nodes for mesh in node.meshes}
     return [(scene, ("nodes", "materials")), *scene.nodes, *meshes.values()]
 
 
-def _shading(scene: SceneContents) -> list[Any]:
+def _shading(scene: SceneContents) -> list[Owner]:
     """Return materials, textures and lights of a scene."""
     used = [*scene.materials, *(mesh.material for node in scene.nodes for mesh in node.meshes)]
     materials = list({id(material): material for material in used}.values())
@@ -319,7 +324,7 @@ def _slots(scene: SceneContents) -> list[list[_Slot]]:
     return slots
 
 
-def _row_edit(material: Material, data: Any, row: int, hint: str) -> str | None:
+def _row_edit(material: Material, data: types.SceneData, row: int, hint: str) -> str | None:
     """Return the first field in which a material differs from its row in the tables of a device, or ``hint``."""
     try:
         textures.check_material(material)
@@ -362,17 +367,17 @@ def _are_lights_read_anew(scene: SceneContents) -> bool:
     return any(light.node is not None and light.node < len(moving) and moving[light.node] for light in scene.lights)
 
 
-def _missing(items: Iterable[Any], others: Iterable[Any]) -> list[Any]:
+def _missing(items: Iterable[Item], others: Iterable[object]) -> list[Item]:
     """Return the items that are not among others, by identity."""
     known = {id(other) for other in others}
     return [item for item in items if id(item) not in known]
 
 
-def _index(items: Iterable[Any], wanted: Any) -> int | None:
+def _index(items: Iterable[object], wanted: object) -> int | None:
     return next((index for index, item in enumerate(items) if item is wanted), None)
 
 
-def _come_or_gone(now: list[Any], old: list[Any]) -> str:
+def _come_or_gone(now: Sequence[Item], old: Sequence[Item]) -> str:
     """Return the name of the first item that was added or removed, and which of both."""
     if len(now) > len(old):
         return f"{(_missing(now, old) or now)[0].name!r} was added"

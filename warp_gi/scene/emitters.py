@@ -21,7 +21,7 @@ LIGHT_KINDS = {
 }
 
 SMALLEST_AREA = 1e-18
-"""Square metres; a smaller triangle cannot be sampled in float32 and is no emitter."""
+"""Area in square metres below which a triangle cannot be sampled in float32, and is no emitter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +29,11 @@ class PlacedEmitters:
     """The emitters of a scene, where they are in the pose of one device; see ``Scene.placed_emitters``."""
 
     table: np.ndarray
-    """types.Emitter [emitter]: emissive triangles, then punctual lights."""
+    """Emitters, types.Emitter [emitter]: emissive triangles first, then punctual lights."""
     corners: np.ndarray
-    """float64 [emissive triangle, 3, 3]: corners in world space, metres; of the first emitters of the table."""
+    """Corners in world space of the table's emissive triangles, metres, float64 [emissive triangle, 3, 3]."""
     two_sided: np.ndarray
-    """bool [emissive triangle]: whether both sides shine."""
+    """Whether both sides shine, bool [emissive triangle]."""
 
 
 def check_light(light: PunctualLight, nodes: Sequence[Node]) -> None:

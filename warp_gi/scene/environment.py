@@ -15,10 +15,10 @@ from __future__ import annotations
 import hashlib
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -39,7 +39,7 @@ LARGEST_HEIGHT = 4096  # texel coordinates must be exact in float32 with bits le
 NEGLIGIBLE_NEGATIVE = 1e-4  # of the sum of all pixels
 
 
-class _Map:
+class SkyMap:
     """Pixels and what is derived from them once: shared by all rotations and scales of one map."""
 
     def __init__(self, pixels: np.ndarray) -> None:
@@ -94,16 +94,16 @@ class Environment:
     """A sky: a latitude-longitude map, a constant colour, or (neither given) black."""
 
     pixels: np.ndarray | None = None
-    """float32 [height, width, 3] radiance in W/(m^2 sr), width = 2 height, row 0 up."""
+    """Radiance map in W/(m^2 sr), float32 [height, width, 3] with width = 2 height, row 0 at the zenith."""
     color: Color | None = None
-    """Constant radiance in W/(m^2 sr)."""
+    """Constant radiance in W/(m^2 sr), RGB; in place of a map."""
     rotation: float = 0.0
-    """Degrees about +y; positive turns the sky counter-clockwise seen from above."""
+    """Angle in degrees about +y; a positive one turns the sky counter-clockwise seen from above."""
     scale: float = 1.0
-    """Multiplies the radiance."""
+    """Factor on the radiance."""
     name: str = "environment"
-    """What error messages call it."""
-    _map: _Map | None = field(default=None, repr=False)
+    """Name in error messages."""
+    _map: SkyMap | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if self.pixels is not None and self.color is not None:
@@ -116,7 +116,7 @@ class Environment:
             self.color = _checked_color(self.color)
         if self.pixels is not None and self._map is None:
             self.pixels = _checked_pixels(self.pixels, self.name)
-            self._map = _Map(self.pixels)
+            self._map = SkyMap(self.pixels)
 
     @staticmethod
     def load(path: str | Path, rotation: float = 0.0, scale: float = 1.0) -> Environment:
@@ -137,7 +137,7 @@ class Environment:
         return Environment(pixels=pixels, rotation=rotation, scale=scale, name=name)
 
     @staticmethod
-    def constant(rgb: Color | float) -> Environment:
+    def constant(rgb: Sequence[float] | np.ndarray | float) -> Environment:
         """Return a sky of one radiance, RGB or grey, in W/(m^2 sr)."""
         return Environment(color=_checked_color(rgb))
 
@@ -175,7 +175,7 @@ class Environment:
         return digest.hexdigest()
 
     @property
-    def appearance(self) -> tuple[Any, ...]:
+    def appearance(self) -> tuple[object, ...]:
         """All that determines the radiance, to the last bit of a rotation; equal for skies that look the same."""
         return self.rotation, self.scale, self.color, self._map and self._map.digest
 
@@ -188,7 +188,7 @@ class Environment:
         """Return this sky itself; what was derived from its pixels is forgotten if they were edited since."""
         if self._map is not None and (self.pixels is not self._map.pixels or self._map.is_edited()):
             self.pixels = _checked_pixels(self.pixels, self.name)
-            self._map = _Map(self.pixels)
+            self._map = SkyMap(self.pixels)
         return self
 
     @property
@@ -198,7 +198,7 @@ class Environment:
         c, s = math.cos(angle), math.sin(angle)
         return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
-    def data(self, device: str | wp.Device | None = None) -> Any:
+    def data(self, device: str | wp.Device | None = None) -> types.Environment:
         """Return the ``kernels.types.Environment`` struct on the device; its arrays are made once a device."""
         target = device if isinstance(device, wp.Device) else get_device(device)
         result = types.Environment()
@@ -217,7 +217,11 @@ class Environment:
         return result
 
 
-def as_environment(value: object) -> Environment:
+Sky = Environment | SunSky | str | Path | float | Sequence[float] | np.ndarray | None
+"""What a scene takes for a sky: one made before, a path to a map, a radiance (RGB or grey), or None for black."""
+
+
+def as_environment(value: Sky) -> Environment:
     """Return an Environment from a path, an RGB triple, a grey number, a SunSky, an Environment, or None (black).
 
     Raises SceneError for anything else, and what ``Environment.load`` raises.
@@ -230,7 +234,7 @@ def as_environment(value: object) -> Environment:
         return Environment(pixels=value.pixels(), name="sun and sky")
     if isinstance(value, str | Path):
         return Environment.load(value)
-    return Environment.constant(value)  # type: ignore[arg-type]
+    return Environment.constant(value)
 
 
 def _checked_color(rgb: object) -> Color:

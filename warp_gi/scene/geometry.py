@@ -13,7 +13,7 @@ from warp_gi.scene.model import Material, Mesh, Node
 from warp_gi.scene.textures import check_material
 
 LARGEST_UV = 1e9
-"""Texture coordinates past it carry no position in float32; infinite ones would make NaN pixels."""
+"""Texture coordinate past which float32 carries no position; infinite ones would make NaN pixels."""
 
 
 @dataclass(eq=False)
@@ -21,17 +21,17 @@ class FlatGeometry:
     """Every node's meshes one after another, in world space."""
 
     points: np.ndarray
-    """float32 [vertex, 3], metres."""
+    """Positions in metres, float32 [vertex, 3]."""
     normals: np.ndarray
-    """float32 [vertex, 3], unit, or zero for flat shading."""
+    """Unit shading normals, or zero for flat shading, float32 [vertex, 3]."""
     uvs: np.ndarray
-    """float32 [vertex, 2], v up."""
+    """Texture coordinates, v up, float32 [vertex, 2]."""
     indices: np.ndarray
-    """int32 [triangle, 3]."""
+    """Vertices of each triangle, int32 [triangle, 3]."""
     materials: np.ndarray
-    """int32 [triangle], index in the scene's materials."""
+    """Index in the scene's materials of each triangle's material, int32 [triangle]."""
     objects: np.ndarray
-    """int32 [triangle], counts the nodes that have meshes."""
+    """Object id of each triangle, int32 [triangle]; it counts the nodes that have meshes."""
     vertex_starts: list[int]
     """First vertex of each node, and the number of vertices at the end."""
 

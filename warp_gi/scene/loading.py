@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import struct
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from warp_gi.errors import OptionError, SceneError, one_line
+from warp_gi.scene.environment import Sky
 from warp_gi.scene.files.images import missing_file
 from warp_gi.scene.files.parts import SceneParts
 from warp_gi.scene.geometry import triangulated
@@ -19,11 +19,11 @@ from warp_gi.scene.scene import Scene
 EXTENSIONS = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
 
 DAMAGE = (ArithmeticError, AttributeError, EOFError, LookupError, NameError, OSError, TypeError, ValueError)
-"""What readers, trimesh's among them, raise on damaged files."""
+"""Exceptions that readers, trimesh's among them, raise on damaged files."""
 
 
 def load_scene(
-    path: str | os.PathLike[str], environment: Any = None, smooth: float | None = None, scale: float = 1.0
+    path: str | os.PathLike[str], environment: Sky = None, smooth: float | None = None, scale: float = 1.0
 ) -> Scene:
     """Load a scene from a GLB, glTF, OBJ (with MTL), PLY, STL or OFF file.
 

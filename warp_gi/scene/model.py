@@ -15,7 +15,7 @@ class Texture:
 
     name: str
     pixels: np.ndarray
-    """uint8 [height, width, 4], RGBA, row 0 at the top as in files."""
+    """RGBA values, uint8 [height, width, 4], row 0 at the top as in files."""
     srgb: bool = True
     """Whether red, green and blue are sRGB-coded (colours) or linear (normals, roughness)."""
     wrap: tuple[str, str] = ("repeat", "repeat")
@@ -32,19 +32,19 @@ class Material:
     alpha: float = 1.0
     metallic: float = 0.0
     roughness: float = 1.0
-    """Perceptual roughness; the GGX alpha is its square."""
+    """Perceptual roughness in [0, 1]; the GGX alpha is its square."""
     specular: float = 1.0
     """KHR_materials_specular factor: 1 is the usual F0 of 0.04, 0 is pure Lambert."""
     emission: Color = (0.0, 0.0, 0.0)
-    """Emitted radiance, W/(m^2 sr), multiplied with ``emission_texture``."""
+    """Emitted radiance in W/(m^2 sr), multiplied with ``emission_texture``."""
     base_color_texture: Texture | None = None
     metallic_roughness_texture: Texture | None = None
-    """Green is roughness, blue is metallic; linear."""
+    """Texture of the roughness (green) and of the metallic factor (blue); linear."""
     normal_texture: Texture | None = None
     emission_texture: Texture | None = None
     normal_scale: float = 1.0
     alpha_cutoff: float | None = None
-    """A hit where alpha < cutoff is passed through; None is opaque."""
+    """Alpha below which a ray passes through the surface; None is opaque."""
     double_sided: bool = True
     """Whether it emits on both sides. Every surface reflects and blocks light on both."""
 
@@ -54,14 +54,14 @@ class Mesh:
     """Triangles of one material, in the space of their object."""
 
     points: np.ndarray
-    """float32 [vertex, 3], metres."""
+    """Vertex positions in metres, float32 [vertex, 3]."""
     indices: np.ndarray
-    """int32 [triangle, 3], counter-clockwise seen from the front."""
+    """Vertices of each triangle, int32 [triangle, 3], counter-clockwise seen from the front."""
     material: Material = field(default_factory=Material)
     normals: np.ndarray | None = None
-    """float32 [vertex, 3] unit shading normals; None is flat shading."""
+    """Unit shading normals, float32 [vertex, 3]; None is flat shading."""
     uvs: np.ndarray | None = None
-    """float32 [vertex, 2], v up; None is all zero."""
+    """Texture coordinates, float32 [vertex, 2], v up; None is all zero."""
     name: str = "mesh"
 
 
@@ -70,14 +70,14 @@ class PunctualLight:
     """A light without size, as KHR_lights_punctual defines it."""
 
     kind: str
-    """"point", "spot" or "directional"."""
+    """Kind of light: "point", "spot" or "directional"."""
     intensity: Color
-    """W/sr a channel (point, spot) or W/m^2 perpendicular to the light (directional)."""
+    """Intensity in W/sr a channel (point, spot), or irradiance in W/m^2 perpendicular to the light (directional)."""
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     direction: tuple[float, float, float] = (0.0, 0.0, -1.0)
-    """The way the light shines."""
+    """Direction in which the light shines, of any length."""
     inner_cone: float = 0.0
-    """Half angle in radians where a spot begins to fall off."""
+    """Half angle in radians at which a spot begins to fall off."""
     outer_cone: float = 0.7853981633974483
     range: float | None = None
     """Distance in metres at which the light ends; None is no limit."""
@@ -93,11 +93,11 @@ class Node:
     name: str
     meshes: list[Mesh] = field(default_factory=list)
     parent_from_node: np.ndarray = field(default_factory=lambda: np.eye(4))
-    """float64 [4, 4] at rest, acting on column vectors."""
+    """Placement at rest, float64 [4, 4], acting on column vectors."""
     parent: int | None = None
     """Index of the parent in Scene.nodes."""
     keyframes: list[Keyframe] | None = None
-    """Animation; replaces ``parent_from_node``."""
+    """Animation of the node, which replaces ``parent_from_node``; None rests."""
 
 
 @dataclass(frozen=True)
@@ -105,8 +105,8 @@ class Keyframe:
     """A rigid pose with scale at a time; linear between keys (rotation: spherical), held outside them."""
 
     time: float
-    """Seconds."""
+    """Time of the pose in seconds."""
     translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rotation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
-    """Unit quaternion x, y, z, w."""
+    """Rotation as a unit quaternion x, y, z, w."""
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)

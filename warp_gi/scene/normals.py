@@ -10,7 +10,7 @@ from warp_gi.errors import OptionError
 from warp_gi.scene.model import Mesh
 
 NORMAL_STEPS = 511
-"""Corners of a vertex share it again if their normals agree to 1 / 511 in each component."""
+"""Steps of each component of a normal within which corners of a vertex share it again."""
 
 
 def smooth_mesh(mesh: Mesh, angle: float) -> Mesh:

@@ -13,7 +13,7 @@ from warp_gi.errors import OptionError
 from warp_gi.kernels import gbuffer
 
 Vector = Sequence[float] | np.ndarray
-"""Three numbers."""
+"""Three numbers, for a position or a direction."""
 
 LARGEST_SIDE = 1 << 16  # pixels; their Morton code has 16 bits an axis
 LARGEST_COUNT = 1 << 30  # pixels; kernels count them in int32
@@ -28,9 +28,9 @@ class Camera:
     """
 
     world_from_camera: np.ndarray
-    """float64 [4, 4], acting on column vectors; its axes are made orthonormal."""
+    """Placement, float64 [4, 4], acting on column vectors; its axes are made orthonormal."""
     hfov: float = 65.0
-    """Horizontal field of view, degrees."""
+    """Horizontal field of view in degrees."""
     resolution: tuple[int, int] = (960, 540)
     """Width and height in pixels."""
     name: str = ""

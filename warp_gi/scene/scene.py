@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import warp as wp
@@ -17,15 +18,16 @@ from warp_gi.launch import get_device
 from warp_gi.scene import animation, emitters, geometry, textures
 from warp_gi.scene.device_scene import DeviceScene
 from warp_gi.scene.edits import Edits
-from warp_gi.scene.model import Keyframe, Material, Node, PunctualLight
+from warp_gi.scene.model import Keyframe, Material, Mesh, Node, PunctualLight
 from warp_gi.scene.sky_motion import appearance, as_sky, sky_at_time
 
 if TYPE_CHECKING:
-    from warp_gi.scene.environment import Environment
+    from warp_gi.bvh import TriangleBvh
+    from warp_gi.scene.environment import Environment, Sky
     from warp_gi.scene.pinhole import Camera
 
 POSES_FOR_BOUNDS = 33
-"""Evenly spaced poses, beside those of the keyframes, that the bounds of an animated scene enclose."""
+"""Number of evenly spaced poses, beside those of the keyframes, that the bounds of an animated scene enclose."""
 
 
 class Scene:
@@ -51,7 +53,7 @@ class Scene:
         self,
         nodes: Sequence[Node],
         lights: Sequence[PunctualLight] = (),
-        environment: Any = None,
+        environment: Sky | Callable[[float], Sky] = None,
         cameras: Mapping[str, Camera] | None = None,
         name: str = "scene",
         camera_nodes: Mapping[str, int] | None = None,
@@ -59,7 +61,8 @@ class Scene:
         self._guard = Guard()
         self.name = name
         self.version = 0
-        """Counts up when the environment or the animation becomes another: what was derived from the scene is stale."""
+        """Number of changes of environment and animation so far. After another one, what was derived from the
+        scene is stale."""
         self.nodes: list[Node] = [replace(node) for node in nodes]
         self.lights: list[PunctualLight] = list(lights)
         self.cameras: dict[str, Camera] = dict(cameras or {})
@@ -70,10 +73,10 @@ class Scene:
             emitters.check_light(light, self.nodes)
         self._flatten()
         self._environment: Environment | None = None
-        self._sky_at: Callable[[float], Any] | None = None
+        self._sky_at: Callable[[float], Sky] | None = None
         self._sky_time: float | None = 0.0
-        """Time that the sky is of, if it is a function of time; None while it changes."""
-        self._sky_shown: tuple[Any, ...] | None = None
+        """Time in seconds of the present sky, if it is a function of time; None while it changes."""
+        self._sky_shown: tuple[object, ...] | None = None
         self.environment = environment
 
     def _flatten(self) -> None:
@@ -94,7 +97,7 @@ class Scene:
     # ---- what is in it ----
 
     @property
-    def lock(self) -> Any:
+    def lock(self) -> threading.RLock:
         """A re-entrant lock: whoever holds it, as each frame and bake does, is the only one to move or edit the scene.
 
         Take it around ``update`` and what is read after it, where other threads render.
@@ -112,9 +115,9 @@ class Scene:
         return self._environment
 
     @environment.setter
-    def environment(self, value: Any) -> None:
+    def environment(self, value: Sky | Callable[[float], Sky]) -> None:
         sky_at = value if callable(value) and not isinstance(value, type) else None
-        sky = as_sky(value) if sky_at is None else sky_at_time(sky_at, 0.0)
+        sky = sky_at_time(sky_at, 0.0) if sky_at is not None else as_sky(cast("Sky", value))
         with self.lock:
             self._sky_at, self._sky_time = sky_at, 0.0
             self._show(sky)
@@ -172,7 +175,7 @@ class Scene:
 
     @property
     def surface_area(self) -> float:
-        """Of all triangles at time 0, one side of each [m^2]."""
+        """Area of all triangles at time 0, one side of each, in square metres."""
         return geometry.surface_area(self._flat.points, self._flat.indices)
 
     @property
@@ -347,12 +350,12 @@ class Scene:
             self.data(device)
             return self._devices[_device(device).alias].light_table()
 
-    def bvh(self, device: str | wp.Device | None = None) -> Any:
+    def bvh(self, device: str | wp.Device | None = None) -> TriangleBvh:
         """Return the TriangleBvh behind ``data(device)``."""
         self.data(device)
         return self._devices[_device(device).alias].bvh
 
-    def resting_bvh(self, device: str | wp.Device | None = None) -> Any:
+    def resting_bvh(self, device: str | wp.Device | None = None) -> TriangleBvh:
         """Return a TriangleBvh of what never moves; ``bvh`` itself if nothing does."""
         with self.lock:
             self.data(device)
@@ -371,7 +374,7 @@ class Scene:
         return np.stack([np.min(boxes, axis=0), np.max(boxes, axis=0)]).astype(np.float32)
 
 
-def _box_corners(mesh: Any) -> np.ndarray:
+def _box_corners(mesh: Mesh) -> np.ndarray:
     """Return the corners [8, 3] of the box around a mesh's points, in the space of its node."""
     box = np.stack([mesh.points.min(axis=0), mesh.points.max(axis=0)])
     return np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(8, 3)
@@ -381,7 +384,7 @@ def _device(device: str | wp.Device | None) -> wp.Device:
     return device if isinstance(device, wp.Device) else get_device(device)
 
 
-def _update(digest: Any, *parts: np.ndarray | str) -> None:
+def _update(digest: hashlib._Hash, *parts: np.ndarray | str) -> None:
     """Add arrays (with their dtype and shape) and texts to a digest."""
     for part in parts:
         if isinstance(part, str):

@@ -54,21 +54,22 @@ class SunSky:
     """A clear sky and its sun over a Lambertian ground."""
 
     elevation: float = 45.0
-    """Of the sun above the horizon, degrees in (0, 90]."""
+    """Angle of the sun above the horizon, degrees in (0, 90]."""
     azimuth: float = 0.0
-    """Of the sun, degrees clockwise seen from above, as on a compass: 0 is -z, 90 is +x."""
+    """Angle of the sun in degrees, clockwise seen from above, as on a compass: 0 is -z, 90 is +x."""
     turbidity: float = 3.0
-    """Haze: 2 is very clear, 6 is hazy; 1.7 to 10."""
+    """Haze of the air, from 1.7 to 10: 2 is very clear, 6 is hazy."""
     ground_albedo: Color = (0.2, 0.2, 0.2)
     """Diffuse reflectance of the ground, which fills the lower half."""
     intensity: float = 0.01
-    """Multiplies the physical radiance (a clear noon is near 500 W/m^2 a channel); 0.01 suits an exposure of 1."""
+    """Factor on the physical radiance (a clear noon is near 500 W/m^2 a channel); 0.01 suits an exposure of 1."""
     sun_intensity: float = 1.0
-    """Multiplies the sun alone; 0 leaves it out."""
+    """Factor on the radiance of the sun alone; 0 leaves it out."""
     sun_diameter: float = 0.53
-    """Apparent, degrees. Larger softens shadows and keeps the light's amount."""
+    """Apparent diameter of the sun in degrees. A larger one softens shadows and keeps the light's amount."""
     height: int = 512
-    """Rows of the map; columns are twice as many. The sun is blurred by about one texel, 180 / height degrees."""
+    """Number of rows of the map; columns are twice as many. The sun is blurred by about one texel, 180 / height
+    degrees."""
 
     def __post_init__(self) -> None:
         for name, low, high in (

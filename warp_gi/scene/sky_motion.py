@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from warp_gi.errors import SceneError
-from warp_gi.scene.environment import Environment, as_environment
+from warp_gi.scene.environment import Environment, Sky, as_environment
 
 ROUNDING = 1e-12
 """Relative error that a whole number of steps may have, once it was divided by ``fps`` and multiplied by it again."""
@@ -22,10 +21,10 @@ class TurningSky:
     Raises SceneError for a sky that cannot be used, or numbers that are not finite.
     """
 
-    sky: Any
+    sky: Sky
     """The sky at time 0: a path to a map, an RGB radiance, an Environment or a SunSky."""
     degrees: float
-    """Angle in degrees by which it turns in ``1 / fps`` seconds; positive is counter-clockwise seen from above."""
+    """Angle in degrees by which the sky turns in ``1 / fps`` seconds; positive is counter-clockwise seen from above."""
     fps: float = 1.0
     """Steps per second. With 1, ``degrees`` is the angle per second; with a camera path's fps, the angle per frame."""
 
@@ -42,15 +41,15 @@ class TurningSky:
         whole = round(steps)
         if abs(steps - whole) <= ROUNDING * max(abs(steps), 1.0):
             steps = whole  # the time of a frame: its angle must not depend on fps
-        return self.sky.rotated(math.fmod(steps * self.degrees, 360.0))
+        return as_environment(self.sky).rotated(math.fmod(steps * self.degrees, 360.0))
 
 
-def as_sky(value: Any) -> Environment | None:
+def as_sky(value: Sky) -> Environment | None:
     """Return an environment from what ``Scene.environment`` takes beside functions of time."""
     return None if value is None else as_environment(value)
 
 
-def sky_at_time(sky_at: Callable[[float], Any], time: float) -> Environment | None:
+def sky_at_time(sky_at: Callable[[float], Sky], time: float) -> Environment | None:
     """Return what a function of time says the sky is; a SceneError about it tells the time."""
     try:
         return as_sky(sky_at(time))
@@ -58,6 +57,6 @@ def sky_at_time(sky_at: Callable[[float], Any], time: float) -> Environment | No
         raise SceneError(f"the sky at {time:g} s: {error}") from error
 
 
-def appearance(sky: Environment | None) -> tuple[Any, ...] | None:
+def appearance(sky: Environment | None) -> tuple[object, ...] | None:
     """Return all that decides how a sky looks, to compare it with another."""
     return None if sky is None else sky.appearance

@@ -25,8 +25,12 @@ _PLAIN = (bool, int, float, str, tuple, type(None))
 class Change(NamedTuple):
     """A field that may have been edited."""
 
-    owner: Any
+    owner: object
     field: str
+
+
+Owner = object | tuple[object, tuple[str, ...]]
+"""A dataclass instance, all of whose fields count; or an object and the names of those that do."""
 
 
 class Watch:
@@ -38,13 +42,13 @@ class Watch:
             can be copied and pickled; else by 64-bit checksums, as fast as memory is read.
     """
 
-    def __init__(self, owners: Sequence[Any], bare: bool = False) -> None:
+    def __init__(self, owners: Sequence[Owner], bare: bool = False) -> None:
         pairs = [owner if isinstance(owner, tuple) else (owner, _field_names(owner)) for owner in owners]
         self._owners = [(owner, names, attrgetter(*names)) for owner, names in pairs]  # of two names at least
         self._values: list[tuple[Any, ...]] = [get(owner) for owner, _, get in self._owners]
-        self._lists: list[tuple[Change, list[Any], list[Any]]] = []
+        self._lists: list[tuple[Change, list[object], list[object]]] = []
         self._arrays: list[tuple[Change, np.ndarray]] = []
-        self._others: list[tuple[Change, Any, int]] = []
+        self._others: list[tuple[Change, object, int]] = []
         seen: set[int] = set()
         for (owner, names, _), values in zip(self._owners, self._values, strict=True):
             for name, value in zip(names, values, strict=True):
@@ -53,7 +57,7 @@ class Watch:
                     self._add(Change(owner, name), value, bare)
         self._sums = None if bare else _Checksums([array for _, array in self._arrays])
 
-    def _add(self, change: Change, value: Any, bare: bool) -> None:
+    def _add(self, change: Change, value: object, bare: bool) -> None:
         if isinstance(value, np.ndarray):
             if _is_immutable(value):
                 return
@@ -137,7 +141,7 @@ def _is_immutable(array: np.ndarray) -> bool:
     return isinstance(base, bytes)
 
 
-def _crc(value: Any) -> int:
+def _crc(value: object) -> int:
     array = np.asarray(value)
     if array.dtype.kind not in "biuf":
         return 0

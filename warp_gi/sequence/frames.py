@@ -71,17 +71,17 @@ class FrameFile:
     """A frame read back from its file."""
 
     buffers: dict[str, np.ndarray]
-    """float32 [height, width] or [height, width, channels]; identifiers are int32."""
+    """Buffers by name, float32 [height, width] or [height, width, channels]; identifiers are int32."""
     formats: dict[str, str]
-    """Stored as "half" or "float", by buffer."""
+    """Storage format by buffer, "half" or "float"."""
     index: int
     time: float
-    """Seconds."""
+    """Time of the frame in seconds from the first one."""
     camera: Camera | None
-    """None in files by other programs."""
+    """Camera of the frame; None in files by other programs."""
     metadata: dict[str, str | int | float]
     timings: dict[str, float] = field(default_factory=dict)
-    """Seconds by stage."""
+    """Wall seconds by stage."""
     attributes: dict[str, Attribute] = field(default_factory=dict)
     """Every attribute of the file, under its own name."""
 

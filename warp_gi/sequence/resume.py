@@ -96,7 +96,7 @@ class Shot:
     """Number of the frame that motion is towards."""
     path: Path
     time: float
-    """Time in seconds."""
+    """Time of the frame in seconds from the first one."""
     camera: Camera
     previous_camera: Camera
     lineage: str = ""
@@ -116,7 +116,7 @@ class Plan:
     restart: str = ""
     """Reason why the sequence is rendered from its first frame though some are there; "" if it is not."""
     dependence: Dependence = Dependence((), ())
-    """How frames depend on those before."""
+    """Dependence of the frames on those before them."""
 
     @property
     def done(self) -> tuple[Shot, ...]:
@@ -286,6 +286,7 @@ class SequenceRun:
 def _why_restart(dependence: Dependence) -> str:
     """Return why every frame is rendered again where some are there already."""
     words = {"denoiser": "the denoiser"}
-    names = [words.get(name, f"the {name.partition('.')[0]} light") for name in dependence.unsaved or dependence.on_past]
+    places = [name.partition(".")[0] for name in dependence.unsaved or dependence.on_past]
+    names = [words.get(place, f"the {place} light") for place in places]
     reason = "" if dependence.unsaved else "no saved state fits, and "
     return f"{reason}{' and '.join(names)} depend{'s' * (len(names) == 1)} on the frames before"

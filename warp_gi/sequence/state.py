@@ -22,9 +22,9 @@ class Dependence:
     """How the frames of a sequence depend on those before them."""
 
     on_past: tuple[str, ...]
-    """Places in the pipeline of what makes them depend: terms, "indirect.ends_in", "denoiser", names of services."""
+    """Places in the pipeline that make frames depend: terms, "indirect.ends_in", "denoiser", names of services."""
     unsaved: tuple[str, ...]
-    """Those among them whose state no file keeps."""
+    """Places among ``on_past`` whose state no file keeps."""
 
     @property
     def kind(self) -> Literal["independent", "saved", "unsaved"]:

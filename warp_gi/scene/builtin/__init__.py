@@ -24,7 +24,7 @@ BUILTIN_SCENES = {
     "two_rooms": "one lit and one dark room with a thin wall between them",
     "warehouse": "rooms of shelves under hundreds of lamps, most of them hidden from any one point",
 }
-"""What there is: name and a line about it."""
+"""Built-in scenes by name, with a line about each."""
 
 
 def builtin_scene(name: str) -> Scene:

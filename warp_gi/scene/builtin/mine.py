@@ -25,17 +25,17 @@ LOW, HIGH = np.array((-25.0, -1.0, -21.0)), np.array((11.0, 12.0, 13.0))  # of t
 CELL = 0.25
 SKY = SunSky(elevation=60.0, azimuth=300.0, turbidity=2.6, intensity=1.0)
 SPOT = np.array((4.3, 0.0, 2.4))
-"""Where the sun meets the floor."""
+"""Point on the floor that the sun reaches, metres."""
 SHAFT_RADIUS = 1.4
 CAVERN = ((-0.5, 1.2, 0.0), (8.0, 5.2, 7.0))
-"""Middle and radii of the ellipsoid."""
+"""Centre and radii of the cavern's ellipsoid, metres."""
 TUNNEL_RADIUS = 1.75
 TUNNELS = {
     "west": ((-6.0, 1.1, 1.0), (-11.0, 1.1, 2.5), (-16.0, 1.1, 1.2), (-22.0, 1.1, 4.5)),
     "north": ((2.5, 1.1, -5.0), (4.5, 1.1, -10.0), (2.0, 1.1, -14.0), (-1.0, 1.1, -18.0)),
     "gallery": ((-16.0, 1.1, 1.2), (-15.0, 1.1, -6.0), (-10.0, 1.1, -12.5), (-1.0, 1.1, -18.0)),
 }
-"""Corners of their middle lines."""
+"""Corners of the tunnels' middle lines, metres, by name."""
 OCTAVES = ((4.5, 0.85), (1.9, 0.45), (0.8, 0.20))
 """Wavelength and amplitude of the rock's relief, metres."""
 PROP_STEP = 2.8

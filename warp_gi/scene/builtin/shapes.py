@@ -24,13 +24,13 @@ class Shape:
     """Triangles; every operation returns a new shape."""
 
     points: np.ndarray
-    """float64 [vertex, 3]"""
+    """Positions in metres, float64 [vertex, 3]."""
     indices: np.ndarray
-    """int32 [triangle, 3]"""
+    """Vertices of each triangle, int32 [triangle, 3]."""
     uvs: np.ndarray
-    """float64 [vertex, 2]"""
+    """Texture coordinates in metres along the surface, float64 [vertex, 2]."""
     normals: np.ndarray
-    """float64 [vertex, 3] unit"""
+    """Unit shading normals, float64 [vertex, 3]."""
 
     @staticmethod
     def of(points: ArrayLike, indices: ArrayLike, uvs: ArrayLike | None = None, crease: float = 40.0) -> Shape:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from warp_gi.scene.builtin.materials import matte, plain
 from warp_gi.scene.builtin.shapes import quad, uv_sphere
 from warp_gi.scene.camera import Camera, CameraKey, CameraPath
-from warp_gi.scene.environment import SunSky
+from warp_gi.scene.environment import Sky, SunSky
 from warp_gi.scene.model import Color, Node
 from warp_gi.scene.scene import Scene
 
@@ -19,7 +19,7 @@ def scene(
     roughnesses: Sequence[float] = ROUGHNESSES,
     metallic: float = 1.0,
     color: Color = (0.91, 0.62, 0.30),
-    environment: object = None,
+    environment: Sky = None,
 ) -> Scene:
     """Return spheres of radius 0.5 m along x on a grey plane, one a perceptual roughness, under a sun and sky."""
     ball = uv_sphere(0.5, 64, 32)

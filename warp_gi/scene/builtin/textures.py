@@ -13,7 +13,7 @@ from warp_gi.scene.model import Color, Texture
 
 SIZE = 512  # pixels
 SRGB_CODES = np.round(255 * encode_srgb(np.linspace(0, 1, 16384))).astype(np.uint8)
-"""uint8 [16384]: sRGB codes of linear values from 0 to 1."""
+"""8-bit sRGB codes of linear values in equal steps from 0 to 1, uint8 [16384]."""
 
 
 @cache

@@ -9,12 +9,13 @@ of punctual lights are taken as radiometric numbers (W/sr, W/m^2) without conver
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pygltflib import GLTF2
+import pygltflib
 
 from warp_gi.errors import SceneError
 from warp_gi.scene.animation import moving_nodes, pose_matrix, world_matrices
@@ -40,7 +41,7 @@ def read_gltf(path: Path) -> SceneParts:
     """Read a .glb or .gltf file; raises SceneError."""
     data = path.read_bytes()
     text, binary = split_glb(memoryview(data), path) if path.suffix.lower() == ".glb" else (data, None)
-    document = GLTF2.from_json(text.decode("utf-8-sig"), infer_missing=True)
+    document = pygltflib.GLTF2.from_json(text.decode("utf-8-sig"), infer_missing=True)
     unknown = sorted(set(document.extensionsRequired or ()) - KNOWN_EXTENSIONS)
     if unknown:
         raise SceneError(f"{str(path)!r} requires {', '.join(unknown)}, which is not supported; export it without")
@@ -48,7 +49,7 @@ def read_gltf(path: Path) -> SceneParts:
 
 
 class _Reader:
-    def __init__(self, document: Any, buffers: Buffers, path: Path) -> None:
+    def __init__(self, document: pygltflib.GLTF2, buffers: Buffers, path: Path) -> None:
         self.document, self.buffers, self.path = document, buffers, path
         self.materials = MaterialReader(document, buffers)
         self.meshes: dict[int, list[Mesh]] = {}
@@ -57,7 +58,7 @@ class _Reader:
         """Return nodes in depth-first order, with what hangs on them."""
         keyframes = read_keyframes(self.document, self.buffers)
         nodes: list[Node] = []
-        sources: list[Any] = []
+        sources: list[pygltflib.Node] = []
         names: set[str] = set()
         pending: list[tuple[int, int | None]] = [(index, None) for index in reversed(self._roots())]
         seen: set[int] = set()
@@ -89,7 +90,7 @@ class _Reader:
             self.meshes[index] = [mesh for mesh in meshes if mesh is not None]
         return self.meshes[index]
 
-    def _primitive(self, source: Any, name: str) -> Mesh | None:
+    def _primitive(self, source: pygltflib.Primitive, name: str) -> Mesh | None:
         """Return one primitive as a mesh, or None if it is not made of triangles."""
         mode = TRIANGLES if source.mode is None else source.mode
         position = getattr(source.attributes, "POSITION", None)
@@ -116,7 +117,7 @@ class _Reader:
             name,
         )
 
-    def _with_lights_and_cameras(self, nodes: list[Node], sources: list[Any]) -> SceneParts:
+    def _with_lights_and_cameras(self, nodes: list[Node], sources: list[pygltflib.Node]) -> SceneParts:
         parts = SceneParts(nodes)
         moving, world = moving_nodes(nodes), world_matrices(nodes, 0.0)
         described = (self.document.extensions or {}).get("KHR_lights_punctual", {}).get("lights", [])
@@ -147,7 +148,7 @@ def _unique(name: str, taken: set[str]) -> str:
     return result
 
 
-def _local_matrix(source: Any) -> np.ndarray:
+def _local_matrix(source: pygltflib.Node) -> np.ndarray:
     if source.matrix:
         return np.array(source.matrix, np.float64).reshape(4, 4).T
     rest = (source.translation or (0.0,) * 3, source.rotation or (0.0, 0.0, 0.0, 1.0), source.scale or (1.0,) * 3)
@@ -168,7 +169,7 @@ def _triangles(corners: np.ndarray, mode: int) -> np.ndarray:
     return corners[rows].reshape(-1, 3).astype(np.int32)
 
 
-def _light(source: dict[str, Any], name: str) -> PunctualLight:
+def _light(source: Mapping[str, Any], name: str) -> PunctualLight:
     intensity = tuple(float(x) * source.get("intensity", 1.0) for x in source.get("color", (1.0, 1.0, 1.0)))
     spot = source.get("spot", {})
     return PunctualLight(

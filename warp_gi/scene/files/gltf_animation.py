@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+import pygltflib
 
 from warp_gi.scene.animation import slerp
 from warp_gi.scene.files.gltf_buffers import Buffers
@@ -48,7 +47,7 @@ class _Channel:
         return slerp(a, b, t) if self.is_rotation else (1.0 - t) * a + t * b
 
 
-def read_keyframes(document: Any, buffers: Buffers) -> dict[int, list[Keyframe]]:
+def read_keyframes(document: pygltflib.GLTF2, buffers: Buffers) -> dict[int, list[Keyframe]]:
     """Return the keyframes of each animated node; where several animations move one property, the first counts."""
     channels: dict[int, dict[str, _Channel]] = {}
     for animation in document.animations:
@@ -64,7 +63,7 @@ def read_keyframes(document: Any, buffers: Buffers) -> dict[int, list[Keyframe]]
     return {node: _merge(document.nodes[node], paths) for node, paths in channels.items() if paths}
 
 
-def _merge(node: Any, channels: dict[str, _Channel]) -> list[Keyframe]:
+def _merge(node: pygltflib.Node, channels: dict[str, _Channel]) -> list[Keyframe]:
     """Return keyframes at all times of the node's channels; a property without one keeps its value at rest."""
     rest = {
         "translation": np.array(node.translation or (0.0, 0.0, 0.0)),

@@ -7,9 +7,9 @@ import binascii
 import struct
 import urllib.parse
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pygltflib
 
 from warp_gi.errors import SceneError
 from warp_gi.scene.files.images import find_file
@@ -59,7 +59,7 @@ def decode_data_uri(uri: str) -> bytes:
 class Buffers:
     """Reads accessors and buffer views of one document (a pygltflib GLTF2)."""
 
-    def __init__(self, document: Any, path: Path, binary: memoryview | None) -> None:
+    def __init__(self, document: pygltflib.GLTF2, path: Path, binary: memoryview | None) -> None:
         self.document, self.path, self.binary = document, path, binary
         self._loaded: dict[int, memoryview] = {}
 

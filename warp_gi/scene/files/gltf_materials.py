@@ -5,9 +5,9 @@ from __future__ import annotations
 import urllib.parse
 import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pygltflib
 
 from warp_gi.errors import SceneError
 from warp_gi.scene.files.gltf_buffers import Buffers, decode_data_uri
@@ -21,7 +21,7 @@ BLEND_CUTOFF = 0.5
 class MaterialReader:
     """Makes each material and each texture of a document once."""
 
-    def __init__(self, document: Any, buffers: Buffers) -> None:
+    def __init__(self, document: pygltflib.GLTF2, buffers: Buffers) -> None:
         self.document, self.buffers = document, buffers
         self._materials: dict[int | None, Material] = {}
         self._images: dict[int, np.ndarray] = {}
@@ -63,7 +63,7 @@ class MaterialReader:
             double_sided=bool(source.doubleSided),
         )
 
-    def _texture(self, info: Any, srgb: bool, material: str) -> Texture | None:
+    def _texture(self, info: pygltflib.TextureInfo | None, srgb: bool, material: str) -> Texture | None:
         if info is None or info.index is None:
             return None
         key = (info.index, srgb)
@@ -101,7 +101,7 @@ class MaterialReader:
         return self._images[index]
 
 
-def texture_transform(source: Any) -> tuple[int, np.ndarray]:
+def texture_transform(source: pygltflib.Material) -> tuple[int, np.ndarray]:
     """Return a material's texture coordinate set and its KHR_texture_transform (float64 [3, 3] on v-down uv).
 
     Textures of one material share one set here: that of the first of base colour,

@@ -29,7 +29,7 @@ from warp_gi.scene.model import Material, Mesh, Node, Texture
 
 METAL_SPECULAR = 0.25
 OPTION_ARGUMENTS = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}
-"""Map options that take more or fewer than one argument."""
+"""Number of arguments of MTL map options that take more or fewer than one."""
 
 
 @dataclass
