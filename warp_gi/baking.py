@@ -149,8 +149,8 @@ def load_bake(path: str | Path) -> Bake:
     if seal != (digest if FORMAT not in metadata else _seal(record, digest)):
         raise _damaged(path)
     try:
-        texts = [str(record[name]) for name in _TEXTS]
-        return Bake(*texts[:2], dict(record["settings"]), arrays, dict(record["counts"]), texts[2])
+        technique, scene_key, scene_name = (str(record[name]) for name in _TEXTS)
+        return Bake(technique, scene_key, dict(record["settings"]), arrays, dict(record["counts"]), scene_name)
     except (KeyError, TypeError, ValueError) as error:
         raise _damaged(path) from error
 
@@ -205,7 +205,7 @@ def _digest(arrays: Mapping[str, np.ndarray]) -> str:
     for name in sorted(arrays):
         array = _stored(name, arrays[name])
         digest.update(json.dumps([name, array.dtype.name, array.shape]).encode())
-        digest.update(array.reshape(-1).view(np.uint8))
+        digest.update(array.reshape(-1).view(np.uint8).data)
     return digest.hexdigest()
 
 
