@@ -44,7 +44,7 @@ _CODES = {"bool": "BOOL"} | {
 
 @dataclass(eq=False)
 class Bake:
-    """What an estimator computed before the first frame, and what it is valid for."""
+    """Results that an estimator computed before the first frame, and the scene and settings that they are valid for."""
 
     technique: str
     """Class name of the estimator."""

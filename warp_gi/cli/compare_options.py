@@ -1,4 +1,4 @@
-"""Options of ``warp-gi bench compare``, and what they name: shared with the processes that it starts."""
+"""Options of ``warp-gi bench compare``, and the scenes and pipelines that they name; its processes share them."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class CompareBench(SceneOptions):
 
 @dataclass(frozen=True)
 class Inputs:
-    """What the options name."""
+    """The scene, camera and pipelines that the options name."""
 
     scene: Scene
     camera: Camera

@@ -187,7 +187,7 @@ def find_output(options: Render) -> Output:
 
 
 def turn_sky(options: Render, scene: Scene | BakedScene, camera: Camera | CameraPath) -> None:
-    """Let the sky turn, if it was asked to."""
+    """Make the sky turn, if ``--environment-turn`` says so."""
     turn, sky = options.environment_turn, scene.environment
     if not math.isfinite(turn):
         raise OptionError(f"--environment-turn must be a finite number of degrees, got {turn:g}")

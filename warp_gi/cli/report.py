@@ -1,4 +1,4 @@
-"""What commands print: a progress bar on a terminal, plain lines elsewhere, tables, or nothing."""
+"""Output of commands: a progress bar on a terminal, plain lines elsewhere, tables, or nothing."""
 
 from __future__ import annotations
 
@@ -254,7 +254,7 @@ def run_command(options: Options, run: Callable[[Options, Reporter], None]) -> i
 
 
 def start_warp(device: str = "cpu", threads: int | None = None) -> None:
-    """Start Warp without its greeting, module log, or word on a missing CUDA driver; check that the device is there.
+    """Start Warp without its greeting, its module log and its message about CUDA; check that the device is there.
 
     ``threads`` is how many the CPU may use; None leaves that as it is. Raises OptionError for a device that is not
     there, or a number of threads out of range.

@@ -39,7 +39,7 @@ class Edit(NamedTuple):
 
 
 class _Slot(NamedTuple):
-    """Where a mesh of a node lies in the flat geometry."""
+    """The place of a node's mesh in the flat geometry."""
 
     mesh: Mesh
     vertices: slice
@@ -49,7 +49,7 @@ class _Slot(NamedTuple):
 
 
 class Edits:
-    """What a scene was made from; made anew whenever the scene reads its nodes again."""
+    """The objects that a scene was made from. Made anew whenever the scene reads its nodes again."""
 
     def __init__(self, scene: SceneContents) -> None:
         self.scene = scene

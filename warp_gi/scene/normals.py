@@ -10,7 +10,7 @@ from warp_gi.errors import OptionError
 from warp_gi.scene.model import Mesh
 
 NORMAL_STEPS = 511
-"""Steps of each component of a normal within which corners of a vertex share it again."""
+"""Steps per unit to which components of normals are rounded, to tell which corners of a vertex can share one."""
 
 
 def smooth_mesh(mesh: Mesh, angle: float) -> Mesh:

@@ -1,4 +1,4 @@
-"""Watches objects for edits: which of their fields are not what they were, in-place edits of arrays and lists included.
+"""Watches objects for edits: tells which of their fields changed, in-place edits of arrays and lists included.
 
 A field counts as changed when it holds another object, another list of the same objects, or an array with other
 bytes. Whether that matters is for the caller to find out: an equal copy of an array counts as changed, too.
@@ -26,7 +26,9 @@ class Change(NamedTuple):
     """A field that may have been edited."""
 
     owner: object
+    """Object whose field may have been edited."""
     field: str
+    """Name of the field."""
 
 
 Owner = object | tuple[object, tuple[str, ...]]
@@ -73,7 +75,7 @@ class Watch:
 
     @property
     def nbytes(self) -> int:
-        """Bytes that are read to find edits of arrays."""
+        """Number of bytes that are read to find edits of arrays."""
         return sum(array.nbytes for _, array in self._arrays)
 
     def changes(self) -> list[Change]:
