@@ -19,12 +19,12 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class GuidedDirections:
-    bits: wp.int32  # of a quadtree
+    bits: wp.int32  # size of a quadtree: 32, 64, 96 or 128
     stratified: wp.int32  # 1: warp two numbers, 0: pick a leaf by a third (the paper's way)
-    trees: wp.array(dtype=wp.vec4ui)  # [leaf]
+    trees: wp.array(dtype=wp.vec4ui)  # [leaf] quadtree
     counts: wp.array(dtype=wp.uint32)  # [leaf * bits / 4] quadtree_counts
     anchors: wp.array(dtype=wp.vec4)  # [leaf] see parallax.py
-    shares: wp.array(dtype=wp.vec2)  # [leaf] of the BSDF, for rough and for glossy surfaces
+    shares: wp.array(dtype=wp.vec2)  # [leaf] share of the BSDF, for rough and for glossy surfaces
 
 
 @wp.func
@@ -35,7 +35,7 @@ def bsdf_share(data: GuidedDirections, region: wp.int32, b: Bsdf) -> wp.float32:
     return shares[0]
 
 
-# Density of the region's tree at a point, 1/sr.
+# Density of a direction by the region's tree at a point, 1/sr.
 @wp.func
 def tree_pdf(data: GuidedDirections, region: wp.int32, s: Surface, wi: wp.vec3) -> wp.float32:
     seen = seen_from_anchor(data.anchors[region], s.position, wi)

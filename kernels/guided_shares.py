@@ -18,12 +18,12 @@ wp.set_module_options({"enable_backward": False})
 
 SHARES = 6
 ShareMoments = wp.types.vector(length=SHARES, dtype=wp.float32)
-FADING = wp.constant(wp.float32(0.8))  # of what is known, each frame
+FADING = wp.constant(wp.float32(0.8))  # share of what is known that stays from frame to frame
 NEAREST_ANCHOR = wp.constant(wp.float32(0.5))  # largest radius of a cell over that of its anchor's sphere
-CORRECTION = wp.constant(wp.float32(0.2))  # of an anchor's nearness, below which it is left
+CORRECTION = wp.constant(wp.float32(0.2))  # relative change of an anchor's nearness below which it stays
 
 
-# One of the shares that are tried. A direction that the quadtree has no idea of has a weight of up to 1 / share.
+# Share number k of those that are tried. A direction that the quadtree hardly proposes has a weight of up to 1 / share.
 @wp.func
 def candidate_share(k: wp.int32) -> wp.float32:
     if k == 0:
@@ -39,7 +39,7 @@ def candidate_share(k: wp.int32) -> wp.float32:
     return 0.97
 
 
-# Share with the least moment; where nothing is known, `otherwise`.
+# The share with the least second moment; `otherwise` where nothing is known.
 @wp.func
 def best_share(moments: ShareMoments, otherwise: wp.float32) -> wp.float32:
     best = float(otherwise)
@@ -53,10 +53,10 @@ def best_share(moments: ShareMoments, otherwise: wp.float32) -> wp.float32:
 
 @wp.struct
 class GuideKnowledge:
-    trees: wp.array(dtype=wp.vec4ui)  # [leaf]
-    shares: wp.array(dtype=wp.vec2)  # [leaf]
-    moments: wp.array(dtype=ShareMoments)  # [2 leaf + is glossy]
-    anchors: wp.array(dtype=wp.vec4)  # [leaf] see parallax.py
+    trees: wp.array(dtype=wp.vec4ui)  # [leaf] quadtree, up to 128 bits
+    shares: wp.array(dtype=wp.vec2)  # [leaf] share of the BSDF, for rough and for glossy surfaces
+    moments: wp.array(dtype=ShareMoments)  # [2 * leaf + is glossy] second moments by share
+    anchors: wp.array(dtype=wp.vec4)  # [leaf] sphere that directions are seen from, see parallax.py
     nearness: wp.array(dtype=wp.vec2)  # [leaf] sums of light, and of light over the distance it came from
     energies: wp.array(dtype=wp.float32)  # [leaf * 4 * bits] QuadtreeAdaptation.energies
 
@@ -99,8 +99,8 @@ def take_over_guides(
     guides.moments[2 * leaf + 1] = known.moments[2 * origin + 1]
 
 
-# Thread: a leaf. Adds its samples to the moments of every share, and chooses; and moves the sphere of its anchor to
-# where light comes from.
+# Thread: a leaf. Adds its samples to the moments of every share, chooses the best share, and moves the sphere of its
+# anchor to where light comes from. Writes its own leaf's items of `guides`.
 @wp.kernel
 def adapt_shares(
     first: wp.int32,

@@ -30,38 +30,38 @@ from warp_gi.kernels.types import EMITTER_TRIANGLE, Emitter, SceneData
 
 wp.set_module_options({"enable_backward": False})
 
-MOST_BUCKETS = wp.constant(64)  # of a region, beside its first
+MOST_BUCKETS = wp.constant(64)  # largest number of buckets of a region, beside its first
 
 
-# The lights of every region.
+# The lights that every region knows, in buckets. Kernels of light_cache_build write them between frames; paths read.
 @wp.struct
 class CacheTables:
     buckets: wp.array(dtype=wp.int32)  # [leaf] number of buckets: 0, 1, or 1 and a power of two
     offsets: wp.array(dtype=wp.int32)  # [leaf] start in `items` and `chances`
-    items: wp.array(dtype=wp.int32)  # of each leaf: where its buckets end, then the emitters bucket by bucket
+    items: wp.array(dtype=wp.int32)  # leaf by leaf: ends of its buckets, then emitters bucket by bucket
     rates: wp.array(dtype=wp.float32)  # [as items] factors of the weights of lights
-    chances: wp.array(dtype=wp.float32)  # of each leaf: of its buckets up to this one together; 1 for the last
+    chances: wp.array(dtype=wp.float32)  # leaf by leaf: chance of its buckets up to this one; 1 for the last
     exploration: wp.array(dtype=wp.float32)  # [leaf] share of samples that explore, beside one of the cache
     alone: wp.array(dtype=wp.int32)  # [leaf] 1: exploring selects the only light, and the cache none
     moments: wp.array(dtype=wp.vec2)  # [leaf] second moments of light samples that do not explore, and that do
-    excesses: wp.array(dtype=wp.float32)  # [leaf] by how much these together exceed those of exploring alone
+    excesses: wp.array(dtype=wp.float32)  # [leaf] excess of their sum over that of exploring alone
 
 
 @wp.struct
 class LightCache:
     shapes: wp.array(dtype=LightShape)  # [emitter]
-    emitters: wp.array(dtype=Emitter)  # [emitter] those of the scene; the rest of it would be much to hand on
+    emitters: wp.array(dtype=Emitter)  # [emitter] lights of the scene
     ltc: LtcTable
     tables: CacheTables
     explores_by_tree: wp.int32  # 1: `tree`, 0: the alias table of the emitters
     tree: LightTree
 
 
-# What selection needs to know of a region.
+# A region, as selecting a light needs it.
 @wp.struct
 class CacheRegion:
     buckets: wp.int32
-    items: wp.int32  # start of its table
+    items: wp.int32  # start of its table in CacheTables.items
     explores: wp.float32  # probability of exploring
     alone: wp.bool  # exploring selects the only light
 
@@ -70,7 +70,7 @@ class CacheRegion:
 class Bucket:
     begin: wp.int32  # in CacheTables.items
     count: wp.int32
-    chance: wp.float32  # of being picked
+    chance: wp.float32  # probability of being picked
 
 
 @wp.func
@@ -101,7 +101,7 @@ def bucket_of(tables: CacheTables, region: CacheRegion, number: wp.int32) -> Buc
     return r
 
 
-# Where a light is, if the region knows it.
+# Bucket and place of a light in a region that knows it.
 @wp.struct
 class BucketPlace:
     bucket: Bucket
@@ -160,7 +160,7 @@ def explored_light_pdf(cache: LightCache, scene: SceneData, s: Surface, emitter:
     return scene.emitters.alias[emitter].pdf
 
 
-# Luminance that a surface reflects of an emitter, were nothing in between. `origin` is the point, `w` its lobes.
+# Luminance that a surface reflects of an emitter if nothing is in between. `origin` is the point, `w` its lobes.
 @wp.func
 def light_weight(
     cache: LightCache, s: Surface, wo: wp.vec3, origin: wp.vec3, w: LobeWeights, emitter: wp.int32
@@ -320,7 +320,7 @@ def cached_light_pdf(
 CACHED_LIGHTS = LightSampler("cache", LightCache, cached_light, cached_light_pdf, another_light, uses_regions=True)
 
 
-# Thread: an emissive triangle. Its shape as it is now.
+# Thread: an emissive triangle. Writes its shape as it is now.
 @wp.kernel
 def shape_lights(
     first: wp.int32, scene: SceneData, luminances: wp.array(dtype=wp.float32), shapes: wp.array(dtype=LightShape)

@@ -34,20 +34,20 @@ from warp_gi.kernels.types import EMITTER_DIRECTIONAL, EMITTER_TRIANGLE
 
 wp.set_module_options({"enable_backward": False})
 
-MOST_LISTED = wp.constant(1024)  # lights of one region
+MOST_LISTED = wp.constant(1024)  # largest number of lights in the list of a region
 FREE = wp.constant(-1)
-LISTS = 8  # that are joined: a region's own, its neighbours', and what it knew
+LISTS = 8  # number of lists that are joined: a region's, its six neighbours', and that of the last frame
 ListEnds = wp.types.vector(length=LISTS, dtype=wp.int32)
 LATEST = wp.constant(0x7FFFFFFF)
 
 
-# Lists of lights by leaf.
+# Lists of lights by leaf. In every kernel here a thread writes its own leaf's entries alone.
 @wp.struct
 class LightLists:
     offsets: wp.array(dtype=wp.int32)  # [leaf] start in `entries`
-    counts: wp.array(dtype=wp.int32)  # [leaf]
+    counts: wp.array(dtype=wp.int32)  # [leaf] number of entries
     entries: wp.array(dtype=wp.int32)
-    tries: wp.array(dtype=wp.vec2)  # of each entry: (samples that saw it, all that tried), none in what was just seen
+    tries: wp.array(dtype=wp.vec2)  # of each entry: (samples that saw it, all that tried), or empty
 
 
 # Ascending order, by Shell's method.
@@ -67,8 +67,8 @@ def sort_entries(entries: wp.array(dtype=wp.int32), begin: wp.int32, count: wp.i
         gap = gap / 3
 
 
-# Thread: a leaf. Lists the lights that its samples saw in the place of its samples, twice as wide, by way of a hash
-# table there.
+# Thread: a leaf. Lists the lights that its samples saw, by way of a hash table. Its room in `entries` begins at twice
+# the start of its samples, and is twice as large as their number.
 @wp.kernel
 def list_seen_lights(first: wp.int32, samples: LeafSamples, lights: wp.array(dtype=wp.uint32), seen: LightLists):
     leaf = first + wp.tid()
@@ -102,7 +102,7 @@ def list_seen_lights(first: wp.int32, samples: LeafSamples, lights: wp.array(dty
     seen.counts[leaf] = found
 
 
-# Thread: a leaf. The longest that its joined list can be.
+# Thread: a leaf. Writes the largest length that its joined list can have.
 @wp.kernel
 def bound_lists(
     first: wp.int32,
@@ -123,8 +123,8 @@ def bound_lists(
     bounds[leaf] = wp.min(bound, MOST_LISTED)
 
 
-# Thread: a leaf. Joins the lights that it and its neighbours saw with those that it knew; `joined.counts` holds what
-# bound_lists says, and then how many there are.
+# Thread: a leaf. Joins the lights that it and its neighbours saw with those that it knew. It finds the bound by
+# bound_lists in `joined.counts`, and replaces it by the length. A light stays for `memory` frames after it was seen.
 @wp.kernel
 def join_lights(
     first: wp.int32,
@@ -174,7 +174,7 @@ def join_lights(
     joined.counts[leaf] = count
 
 
-MOST_TRIES = wp.constant(wp.float32(32.0))  # that are remembered of a light
+MOST_TRIES = wp.constant(wp.float32(32.0))  # largest number of tries of a light that are remembered
 
 
 # Factor for the weight of a light that `tries` (seen, all) of a region's samples tried. A light that a share r of them
@@ -243,11 +243,11 @@ def weigh_light_samples(
             joined.tries[i] = tries * (MOST_TRIES / tries[1])
 
 
-MAIN = wp.constant(wp.float32(-1.0))  # instead of the importance of lights in the first bucket
-LEAST_CHANCE = wp.constant(wp.float32(0.02))  # shared by all buckets evenly
+MAIN = wp.constant(wp.float32(-1.0))  # stands for the importance of lights in the first bucket
+LEAST_CHANCE = wp.constant(wp.float32(0.02))  # chance that is shared evenly by all buckets
 
 
-# Irradiance that a light may bring to a region around `center`, but for what it meets there at a slant.
+# Irradiance that a light may bring to surfaces in a region around `center` that face it.
 @wp.func
 def region_importance(cache: LightCache, emitter: wp.int32, center: wp.vec3, radius: wp.float32) -> wp.float32:
     shape = cache.shapes[emitter]
@@ -268,8 +268,8 @@ def region_importance(cache: LightCache, emitter: wp.int32, center: wp.vec3, rad
     return luminance(light.intensity) / (wp.length_sq(light.position - center) + radius * radius)
 
 
-# Thread: a leaf. What each of its lights may bring to it, and which of them matter most: those are marked MAIN.
-# `sums` is what these bring together.
+# Thread: a leaf. Writes the irradiance that each of its lights may bring, or MAIN for those that matter most, which go
+# to the first bucket; `sums` gets the irradiance of the latter together.
 @wp.kernel
 def rank_lights(
     first: wp.int32,
@@ -305,7 +305,7 @@ def rank_lights(
     sums[leaf] = total
 
 
-# Lights in the fullest of `buckets` buckets of those that are not MAIN, which go by the emitter's last bits.
+# Number of lights in the fullest of `buckets` buckets for lights that are not MAIN; the emitter's last bits decide.
 @wp.func
 def fullest_bucket(
     joined: LightLists, importances: wp.array(dtype=wp.float32), leaf: wp.int32, buckets: wp.int32
@@ -321,7 +321,7 @@ def fullest_bucket(
     return most
 
 
-# Thread: a leaf. Chooses the number of its buckets: the least that hold its lights.
+# Thread: a leaf. Writes the number of its buckets, the least that hold its lights, and the size of its table.
 @wp.kernel
 def count_buckets(
     first: wp.int32,
@@ -351,8 +351,8 @@ def count_buckets(
     sizes[leaf] = chosen + count
 
 
-# Thread: a leaf. Spreads its lights over its buckets; what does not fit into the last of them is left to exploration.
-# Buckets are picked by what they may bring, but none is left out.
+# Thread: a leaf. Spreads its lights over its buckets; lights that do not fit into the last one are left to exploration.
+# A bucket's chance follows the irradiance that its lights may bring, but none has a chance of 0.
 @wp.kernel
 def fill_buckets(
     first: wp.int32,

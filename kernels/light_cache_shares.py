@@ -18,48 +18,48 @@ from warp_gi.kernels.samples import LIGHT_ALONE, LIGHT_EXPLORED, LIGHT_VISIBLE
 wp.set_module_options({"enable_backward": False})
 
 SMALLEST_MOMENT = wp.constant(wp.float32(1.0e-30))
-EXPLORATION_PRICE = wp.constant(wp.float32(0.1))  # of the error, that all samples' exploring is worth
-FADING = wp.constant(wp.float32(0.8))  # of moments, each frame
-PAIR_MARGIN = wp.constant(wp.float32(1.5))  # for what points next to each other do not have in common
-SIGHTINGS = wp.constant(3)  # of each light on average, from which on a region starts with the cache
+EXPLORATION_PRICE = wp.constant(wp.float32(0.1))  # share of the error that is given for exploring by all samples
+FADING = wp.constant(wp.float32(0.8))  # share of moments that stays from frame to frame
+PAIR_MARGIN = wp.constant(wp.float32(1.5))  # factor for differences between neighbouring points
+SIGHTINGS = wp.constant(3)  # sightings of each light, on average, from which on a region starts with the cache
 
 
 @wp.struct
 class CacheSettings:
-    capacity: wp.int32  # lights a bucket
+    capacity: wp.int32  # largest number of lights in a bucket
     hysteresis: wp.float32  # share of the capacity that must suffice for fewer buckets than before
-    first_exploration: wp.float32  # share of samples, of regions that nothing is known of
-    least_exploration: wp.float32
+    first_exploration: wp.float32  # share of samples that explore in regions without knowledge
+    least_exploration: wp.float32  # range of that share elsewhere
     most_exploration: wp.float32
     may_be_alone: wp.int32  # 1: regions learn where exploring alone is better
 
 
-# What a region learns of exploring.
+# What a region has learnt about exploring.
 @wp.struct
 class Exploration:
     has_lights: wp.bool  # its samples could be selected by the cache
-    share: wp.float32
-    alone: wp.int32
-    moments: wp.vec2
-    excess: wp.float32
+    share: wp.float32  # of samples that explore
+    alone: wp.int32  # CacheTables.alone
+    moments: wp.vec2  # CacheTables.moments
+    excess: wp.float32  # CacheTables.excesses
 
 
-# Sums over light samples of squared luminances, of a region.
+# Sums over the light samples of a region of squared luminances.
 @wp.struct
 class LightMoments:
-    offered: wp.float32  # of those by the cache
-    explored: wp.float32  # of those by exploring, of lights that the cache does not offer
+    offered: wp.float32  # samples by the cache
+    explored: wp.float32  # samples by exploring, of lights that the cache does not offer
     excess: wp.float32  # by how much both choices together exceed exploring alone
     # of samples by exploring alone
-    last: wp.float32  # what the last one brought
-    pairs: wp.float32  # products of each with the one before
-    # of those of them that know what the cache would do
+    last: wp.float32  # luminance of the last sample
+    pairs: wp.float32  # products of luminances of successive samples
+    # samples among them that know the density by the cache
     alone: wp.float32  # their second moment
-    cached: wp.float32  # that of the cache's choice, and of the choice to explore beside it
+    cached: wp.float32  # second moment of the cache's choice; and the next: of the choice to explore beside it
     beside: wp.float32
-    by_cache: wp.float32  # luminance that these two would bring
+    by_cache: wp.float32  # luminance that these two choices would bring
     by_exploring: wp.float32
-    probes: wp.float32  # how many
+    probes: wp.float32  # number of those samples
 
 
 # Share of samples that explore. What exploring brings, of lights that the cache does not offer, varies with moments[1]
@@ -114,7 +114,7 @@ def add_light_sample(
     return r
 
 
-# By how much the variance of both choices exceeds that of exploring alone.
+# Excess of the variance of both choices over that of exploring alone.
 #
 # The variance of two independent choices is larger than the sum of their second moments tells, by twice the product of
 # their means. Where exploring is alone, that is at most the root of the product of the moments, and about a product of
@@ -138,7 +138,7 @@ def unmet_moment(m: LightMoments) -> wp.float32:
     return (1.0 - FADING) * m.alone / wp.max(m.probes, 1.0)
 
 
-# What the region `origin` knew.
+# What the region `origin` of the last frame knew.
 @wp.func
 def known_exploration(known: CacheTables, origin: wp.int32, settings: CacheSettings) -> Exploration:
     r = Exploration()

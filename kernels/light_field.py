@@ -17,13 +17,13 @@ NOTHING = wp.constant(wp.float32(65536.0))  # distance of a texel that sees the 
 SURFEL_EMITS = wp.constant(wp.uint32(0x8000))  # bit of a surfel whose texel is in LightField.emission_texels
 
 PROBE_USABLE = wp.constant(0)
-PROBE_COVERED = wp.constant(1)  # inside of something: left out
+PROBE_COVERED = wp.constant(1)  # the probe is inside of something, and left out
 
-MOMENT_REACH = wp.constant(wp.float32(2.0))  # diagonals of a cage; moments count no distance as more
+MOMENT_REACH = wp.constant(wp.float32(2.0))  # largest distance in moments, in diagonals of a cage
 WEIGHT_FLOOR = wp.constant(wp.float32(1.0e-3))
 COSINE_FLOOR = wp.constant(wp.float32(1.0e-3))
-OUTSIDE = wp.constant(wp.float32(1.0))  # distances between probes
-SURFEL_TOLERANCE = wp.constant(wp.float32(8.0))  # texels; about 1.5 degrees at 256
+OUTSIDE = wp.constant(wp.float32(1.0))  # distance from the grid that counts as outside, in distances between probes
+SURFEL_TOLERANCE = wp.constant(wp.float32(8.0))  # slack of a surfel's plane in texels; 1.5 degrees at 256
 
 _LARGEST_HALF = wp.constant(wp.float32(65504.0))
 _LARGEST_SHARED = wp.constant(wp.float32(65408.0))  # 511 * 2^7, the largest number of RGB9E5
@@ -33,25 +33,25 @@ _FLOAT_SCALE = wp.constant(wp.float32(5.192296858534828e33))  # 2^112
 
 @wp.struct
 class LightField:
-    low: wp.vec3  # where probe (0, 0, 0) is in the grid
+    low: wp.vec3  # position of probe (0, 0, 0) in the grid, metres
     spacing: wp.vec3  # metres between probes; above 0 also along an axis of one
     counts: wp.vec3i  # probe (x, y, z) has index (z counts.y + y) counts.x + x
     resolution: wp.int32  # texels along a side of a map, a multiple of BLOCK
     irradiance_resolution: wp.int32
     bias: wp.float32  # metres along the normal by which points leave their surface before visibility is asked for
-    least_seen: wp.float32  # share of the weights around a point that probes which see it have, or nothing is known
+    least_seen: wp.float32  # least share of the weights around a point of probes that see it, for its light to be known
     plain: wp.int32  # 1: interpolate as if every probe saw every point, as irradiance probes did before the paper
-    bounds_low: wp.vec3  # of the scene: a ray that leaves them meets nothing any more
+    bounds_low: wp.vec3  # bounds of the scene, metres; a ray that leaves them meets nothing
     bounds_high: wp.vec3
-    positions: wp.array(dtype=wp.vec3)  # [probe], in the grid or moved out of a wall
+    positions: wp.array(dtype=wp.vec3)  # [probe] metres; in the grid, or moved out of a wall
     states: wp.array(dtype=wp.int32)  # [probe] PROBE_*
-    radiance: wp.array(dtype=wp.uint32)  # [probe * resolution^2] RGB9E5: reflected by the surfel, or that of the sky
-    surfels: wp.array(dtype=wp.uint32)  # [probe * resolution^2] pack_surfel
-    nearest: wp.array(dtype=wp.float32)  # [probe * (resolution / BLOCK)^2] least distance in a block or next to it
-    irradiance: wp.array(dtype=wp.vec3)  # [probe * irradiance_resolution^2] W/m^2 by reflected light
-    moments: wp.array(dtype=wp.vec2)  # [probe * irradiance_resolution^2] mean of distance [m] and of its square
-    emission_texels: wp.array(dtype=wp.int32)  # [emissive texel] index in surfels, ascending
-    emission: wp.array(dtype=wp.uint32)  # [emissive texel] RGB9E5
+    radiance: wp.array(dtype=wp.uint32)  # [probe * resolution^2] RGB9E5: radiance the surfel reflects, or the sky's
+    surfels: wp.array(dtype=wp.uint32)  # [probe * resolution^2] distance, normal and a bit: pack_surfel
+    nearest: wp.array(dtype=wp.float32)  # [probe * (resolution / BLOCK)^2] metres to the nearest in or by a block
+    irradiance: wp.array(dtype=wp.vec3)  # [probe * irradiance_resolution^2] irradiance by reflected light, W/m^2
+    moments: wp.array(dtype=wp.vec2)  # [probe * irradiance_resolution^2] mean of distance [m] and of its square [m^2]
+    emission_texels: wp.array(dtype=wp.int32)  # [emissive texel] index in `surfels`, ascending
+    emission: wp.array(dtype=wp.uint32)  # [emissive texel] RGB9E5: radiance that the surfel emits
 
 
 # ---- texels ----
@@ -106,8 +106,8 @@ def unpack_half(bits: wp.uint32) -> wp.float32:
     return wp.cast((bits & wp.uint32(0x7FFF)) << wp.uint32(13), wp.float32) * _FLOAT_SCALE
 
 
-# Distance as a half in the low bits, unit normal as octahedral coordinates in twice 8 bits above: in 254 steps, for
-# the axes to be among them.
+# Distance as a half in the low 16 bits, unit normal as octahedral coordinates in 8 bits each above. They have 254
+# steps, so that the axes are among them.
 @wp.func
 def pack_surfel(distance: wp.float32, normal: wp.vec3) -> wp.uint32:
     uv = octahedral_encode(normal)
@@ -116,7 +116,7 @@ def pack_surfel(distance: wp.float32, normal: wp.vec3) -> wp.uint32:
     return pack_half(distance) | (x << wp.uint32(16)) | (y << wp.uint32(24))
 
 
-# Metres from the probe, or NOTHING.
+# Distance from the probe in metres, or NOTHING.
 @wp.func
 def surfel_distance(word: wp.uint32) -> wp.float32:
     return unpack_half(word)

@@ -45,38 +45,42 @@ wp.set_module_options({"enable_backward": False})
 
 LOBE = wp.constant(wp.float32(50.0))  # power of the cosine that distances are filtered with
 LOBE_END = wp.constant(wp.float32(0.85))  # cosine below which its power, 3e-4, counts as 0
-SAME_DISTANCE = wp.constant(wp.float32(0.1))  # surfels that differ by less share their irradiance
-SAME_NORMAL = wp.constant(wp.float32(0.9))
-TEXEL_BACK = wp.constant(wp.uint8(1))  # sees the back of a triangle
-TEXEL_SAME = wp.constant(wp.uint8(2))  # sees the surfel that it saw before
+SAME_DISTANCE = wp.constant(wp.float32(0.1))  # relative difference of distances below which surfels share irradiance
+SAME_NORMAL = wp.constant(wp.float32(0.9))  # cosine between normals above which they do
+TEXEL_BACK = wp.constant(wp.uint8(1))  # the texel sees the back of a triangle
+TEXEL_SAME = wp.constant(wp.uint8(2))  # the texel sees the surfel that it saw before
 
 
-# What is known of the texels of some probes only while they are filled, [slot * resolution^2].
+# What is known of the texels of some probes while they are filled, [slot * resolution^2] unless a field says otherwise;
+# slot k holds probe probes[k]. trace_texels writes `direct`, `albedo`, `emission` and `back`, bounce writes `light`,
+# reduce_distances writes `distances`; each thread writes its own items alone. Maps of LightField are written by
+# trace_texels (surfels), bounce (radiance), filter_light, filter_distances and find_nearest, each its own probes'.
 @wp.struct
 class ProbeWork:
-    probes: wp.array(dtype=wp.int32)  # [slot] their indices
-    rays: wp.int32  # of a texel: the first is through its middle, the others anywhere in it
+    probes: wp.array(dtype=wp.int32)  # [slot] index of the probe
+    rays: wp.int32  # rays a texel: the first is through its middle, the others anywhere in it
     seed: wp.uint32
-    sky_probability: wp.float32  # PathSettings; and the next two, of paths from surfels outside of the grid
+    sky_probability: wp.float32  # this and the next two are PathSettings of paths from surfels outside of the grid
     max_depth: wp.int32
     roulette_depth: wp.int32
     radius: wp.float32  # metres; distances count as no more than this in the moments
     hysteresis: wp.float32  # share of the old irradiance that is kept
-    direct: wp.array(dtype=wp.uint32)  # RGB9E5, reflected direct light
-    albedo: wp.array(dtype=wp.uint32)  # RGB9E5
-    emission: wp.array(dtype=wp.uint32)  # RGB9E5; empty if no one asks for it
+    direct: wp.array(dtype=wp.uint32)  # RGB9E5: direct light that the surfel reflects, W/(m^2 sr)
+    albedo: wp.array(dtype=wp.uint32)  # RGB9E5: reflectance for light from between the probes
+    emission: wp.array(dtype=wp.uint32)  # RGB9E5: radiance that the surfel emits, W/(m^2 sr); or empty
     back: wp.array(dtype=wp.uint8)  # TEXEL_*
-    is_last: wp.int32  # 1: set the radiance of texels too, which no one reads before
+    is_last: wp.int32  # 1 in the last bounce, which sets the radiance of texels too; none reads it earlier
     light_low: wp.int32  # texels along a side of the maps that irradiance is filtered from
     light_directions: wp.array(dtype=wp.vec4)  # [light_low^2] unit direction and solid angle [sr] of their texels
     light: wp.array(dtype=wp.vec3)  # [slot * light_low^2] reflected radiance
-    distance_low: wp.int32  # the same for moments of distance
-    distance_directions: wp.array(dtype=wp.vec4)
-    distances: wp.array(dtype=wp.vec2)
+    distance_low: wp.int32  # texels along a side of the maps that moments are filtered from
+    distance_directions: wp.array(dtype=wp.vec4)  # [distance_low^2] as light_directions
+    distances: wp.array(dtype=wp.vec2)  # [slot * distance_low^2] mean of distance [m] and of its square [m^2]
 
 
-# Direct light that the surface a ray meets reflects back, and its reflectance of what comes from between the probes. Of
-# a surface outside of the grid, where no probe is near, all light is sampled here by a path, and the reflectance is 0.
+# The surface that a ray meets: direct light that it reflects back, W/(m^2 sr), and its reflectance for light from
+# between the probes. For a surface outside of the grid, where no probe is near, `direct` is all light, found by a path,
+# and `albedo` is 0.
 @wp.struct
 class TexelSample:
     face: wp.int32
@@ -124,7 +128,7 @@ def sample_texel(
     return r
 
 
-# Thread: a texel of a probe. Its surfel, and its share of the direct light.
+# Thread: a texel of a probe. Traces its rays, and writes its surfel and the direct light that this reflects.
 @wp.kernel
 def trace_texels(first: wp.int32, scene: SceneData, field: LightField, work: ProbeWork):
     item = first + wp.tid()
@@ -179,16 +183,16 @@ def trace_texels(first: wp.int32, scene: SceneData, field: LightField, work: Pro
         work.albedo[item] = pack_radiance(albedo / rays)
 
 
-# Irradiance that some texels of a map share, and which.
+# Irradiance [W/m^2] that neighbouring texels of a map share, and the surfel that it was looked up at.
 @wp.struct
 class SharedIrradiance:
     value: wp.vec3
-    distance: wp.float32  # of the surfel it was looked up at; negative: of none yet
-    normal: wp.vec3
+    distance: wp.float32  # metres from the probe to that surfel; negative before the first lookup
+    normal: wp.vec3  # unit normal of that surfel
 
 
-# Irradiance at a surfel; what is known of a neighbour where both lie on about the same surface, for irradiance is
-# smooth and looking it up costs more than all else here.
+# Irradiance at a surfel: that of a neighbour where both lie on about the same surface, else looked up. Irradiance is
+# smooth, and looking it up costs more than all else here.
 @wp.func
 def shared_irradiance(
     field: LightField, origin: wp.vec3, texel: wp.int32, surfel: wp.uint32, known: SharedIrradiance
@@ -201,8 +205,9 @@ def shared_irradiance(
     return SharedIrradiance(irradiance_at(field, position, normal), distance, normal)
 
 
-# Thread: a texel of the maps that irradiance is filtered from. Sets the radiance of the texels in it from direct light
-# and the irradiance between the probes, and the mean over them; `side` x `side` texels share what arrives.
+# Thread: a texel of the maps that irradiance is filtered from. Computes the radiance of the texels of the large map in
+# it from direct light and the irradiance between the probes, and writes its mean to `work.light`, in the last bounce
+# also each texel's to `field.radiance`. Blocks of `side` x `side` texels share one lookup of irradiance.
 @wp.kernel
 def bounce(first: wp.int32, field: LightField, work: ProbeWork, side: wp.int32):
     item = first + wp.tid()
@@ -244,7 +249,7 @@ def bounce(first: wp.int32, field: LightField, work: ProbeWork, side: wp.int32):
     work.light[item] = total / wp.float32(scale * scale)
 
 
-# Thread: a texel of a probe's irradiance map. Weights are normalised, so that a constant stays one.
+# Thread: a texel of a probe's irradiance map, which it writes. Weights sum to one, so that a constant stays constant.
 @wp.kernel
 def filter_light(first: wp.int32, field: LightField, work: ProbeWork):
     item = first + wp.tid()
@@ -266,7 +271,7 @@ def filter_light(first: wp.int32, field: LightField, work: ProbeWork):
     field.irradiance[to] = field.irradiance[to] * work.hysteresis + arriving * (1.0 - work.hysteresis)
 
 
-# Thread: a texel of the maps that moments are filtered from: the mean of the distance and of its square in it.
+# Thread: a texel of the maps that moments are filtered from. Writes the mean of distance and of its square in it.
 @wp.kernel
 def reduce_distances(first: wp.int32, field: LightField, work: ProbeWork):
     item = first + wp.tid()
@@ -286,7 +291,7 @@ def reduce_distances(first: wp.int32, field: LightField, work: ProbeWork):
     work.distances[item] = moments / wp.float32(scale * scale)
 
 
-# Thread: a texel of a probe's map of moments, filtered by a power of the cosine (section 5.2).
+# Thread: a texel of a probe's map of moments. Writes it, filtered by a power of the cosine (section 5.2).
 @wp.kernel
 def filter_distances(first: wp.int32, field: LightField, work: ProbeWork):
     item = first + wp.tid()
@@ -308,7 +313,7 @@ def filter_distances(first: wp.int32, field: LightField, work: ProbeWork):
     field.moments[work.probes[slot] * size + texel] = moments / weight
 
 
-# Thread: a block of a probe's map: the least distance in it and in the texels around it, whose surfels may reach in.
+# Thread: a block of a probe's map. Writes the least distance in it and in the texels around it, which may reach in.
 @wp.kernel
 def find_nearest(first: wp.int32, field: LightField, work: ProbeWork):
     item = first + wp.tid()

@@ -26,18 +26,18 @@ wp.set_module_options({"enable_backward": False})
 
 VISIBILITY_PROBES = wp.constant(0)
 VISIBILITY_EXACT = wp.constant(1)
-IN_SIGHT = wp.constant(wp.float32(0.3))  # by the maps, whose bounds are kind to what is hidden
+IN_SIGHT = wp.constant(wp.float32(0.3))  # chance by the maps from which on a probe counts as seeing a point
 
 
-# What probes say of the light at a point.
+# Light at a point as probes know it.
 @wp.struct
 class SeenLight:
     irradiance: wp.vec3  # W/m^2, by reflected light; 0 where nothing is known
-    probes: wp.int32  # in front of the surface that see the point
-    trust: wp.float32  # 1 where enough of them do, 0 where none does
+    probes: wp.int32  # number of probes in front of the surface that see the point
+    trust: wp.float32  # 1 where enough probes see the point, 0 where none does, and between in between
 
 
-# The irradiance between the probes that see a point with a unit normal, by their maps or by shadow rays.
+# Irradiance between the probes that see a point with a unit normal, by their maps or by shadow rays (`visibility`).
 @wp.func
 def seen_light(
     scene: SceneData, field: LightField, visibility: wp.int32, position: wp.vec3, normal: wp.vec3, origin: wp.vec3
@@ -73,7 +73,7 @@ def seen_light(
     return r
 
 
-# What a surface reflects of it, in every direction alike.
+# Radiance [W/(m^2 sr)] that a surface reflects of that irradiance, in every direction alike.
 @wp.func
 def cached_radiance(s: Surface, seen: SeenLight) -> wp.vec3:
     return wp.cw_mul(average_reflectance(s.bsdf), seen.irradiance) / wp.pi
@@ -82,7 +82,7 @@ def cached_radiance(s: Surface, seen: SeenLight) -> wp.vec3:
 @wp.struct
 class ProbeCache:
     field: LightField
-    visibility: wp.int32  # VISIBILITY_*: who tells which probes see a point
+    visibility: wp.int32  # VISIBILITY_*: how probes that see a point are found
 
 
 @wp.func

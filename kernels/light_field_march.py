@@ -33,22 +33,22 @@ from warp_gi.kernels.octahedral_line import MapCell, MapLine, enter_cells, map_l
 
 wp.set_module_options({"enable_backward": False})
 
-MISS = wp.constant(0)  # seen until t_max or out of the scene's bounds
+MISS = wp.constant(0)  # nothing is in the way up to t_max or the scene's bounds
 HIT = wp.constant(1)
 UNKNOWN = wp.constant(2)  # no probe saw further: t, probe and texel are those of the last occluder
-STOPPED = wp.constant(3)  # after most_steps
+STOPPED = wp.constant(3)  # stopped after most_steps
 _ON = wp.constant(-1)  # no answer yet
 
 _TEXEL = wp.constant(wp.float32(3.0))  # half the diagonal of a texel in radians, times the resolution: 2.0 to 4.3
-_STEEPEST = wp.constant(wp.float32(0.05))  # cosine at which a probe sees a surfel, at the least
-_HALF = wp.constant(wp.float32(4.9e-4))  # precision of distances, relative, 2^-11
-_NORMAL = wp.constant(wp.float32(0.01))  # of normals, in radians
+_STEEPEST = wp.constant(wp.float32(0.05))  # least cosine at which a probe sees a surfel
+_HALF = wp.constant(wp.float32(4.9e-4))  # relative precision of distances, 2^-11
+_NORMAL = wp.constant(wp.float32(0.01))  # precision of normals in radians
 _GAP = wp.constant(wp.float32(0.5))  # texels between two planes that are no longer one surface
 _SURE = wp.constant(wp.float32(0.1))  # doubt of a surfel's own middle; at most 0.25 at the border of its texel
-_ACCEPTED = wp.constant(wp.float32(0.3))  # doubt of a hit
-_MARGIN = wp.constant(wp.float32(0.02))  # of the bounds, relative to their size
-_TURNS = wp.constant(8 + 3 * 64)  # of probe_in_turn
-_MOST_PROBES = wp.constant(64)  # asked for one ray
+_ACCEPTED = wp.constant(wp.float32(0.3))  # largest doubt of a hit that is believed
+_MARGIN = wp.constant(wp.float32(0.02))  # margin of the scene's bounds, relative to their size
+_TURNS = wp.constant(8 + 3 * 64)  # number of places of probe_in_turn
+_MOST_PROBES = wp.constant(64)  # largest number of probes that one ray asks
 
 
 @wp.struct
@@ -56,14 +56,14 @@ class MarchHit:
     result: wp.int32  # MISS, HIT, UNKNOWN or STOPPED
     t: wp.float32  # metres along the ray
     probe: wp.int32  # whose map holds the texel; -1 if the ray is outside of the bounds or no probe can be asked
-    texel: wp.int32  # of the surfel hit, of the last occluder, or where the ray ends
+    texel: wp.int32  # texel of the surfel hit, of the last occluder, or where the ray ends
     steps: wp.int32  # texels looked at
     blocks: wp.int32  # blocks looked at
     probes: wp.int32  # probes asked
-    level: wp.int32  # of the last look: 0 a texel, 1 a block
+    level: wp.int32  # level of the last look: 0 a texel, 1 a block
     last: wp.int32  # texel or block of the last look, -1 before a probe's first
-    safe: wp.float32  # until here the ray was in front of what the probe sees
-    seen: wp.int32  # 1 if it was so anywhere
+    safe: wp.float32  # metres along the ray up to which it was in front of what the probe sees
+    seen: wp.int32  # 1 if it was in front anywhere
     doubt: wp.float32  # of an UNKNOWN of one probe: how likely it is no hit, in texels; infinite if hidden for sure
 
 
@@ -72,11 +72,11 @@ class MarchHit:
 class ProbeRay:
     origin: wp.vec3
     direction: wp.vec3
-    map_start: wp.int32  # of the probe in LightField.surfels
-    blocks_start: wp.int32  # in LightField.nearest
+    map_start: wp.int32  # first texel of the probe in LightField.surfels
+    blocks_start: wp.int32  # first block of the probe in LightField.nearest
     most_steps: wp.int32
-    nearer: wp.float32  # how much nearer than its middle a surfel comes within its texel
-    width: wp.float32  # of a texel in the map, of which sides are 2
+    nearer: wp.float32  # share by which a surfel comes nearer within its texel than in its middle
+    width: wp.float32  # side of a texel, in a map whose sides are 2
 
 
 # Square of the greatest distance from the probe between two times.

@@ -29,10 +29,10 @@ from warp_gi.kernels.types import SceneData
 
 wp.set_module_options({"enable_backward": False})
 
-PLACE_STEPS = wp.constant(6)
-PLACE_BACK = wp.constant(wp.float32(0.25))  # share of back faces from which a probe looks for a way out
-LIGHT_DEPTH = wp.constant(6)  # edges of the longest path that says where light is
-REACH_VERTICES = wp.constant(3)  # of a path that says what a camera's light goes over: the first hit and two more
+PLACE_STEPS = wp.constant(6)  # largest number of moves of a probe
+PLACE_BACK = wp.constant(wp.float32(0.25))  # share of back faces above which a probe leaves through one
+LIGHT_DEPTH = wp.constant(6)  # edges of the longest path that finds where light is
+REACH_VERTICES = wp.constant(3)  # vertices of a path that finds what a camera reaches: the first hit and two more
 PROBE_FACTOR = wp.constant(wp.uint32(2654435769))
 
 
@@ -45,7 +45,7 @@ def sees_back(scene: SceneData, face: wp.int32, direction: wp.vec3) -> wp.int32:
     return wp.where(wp.dot(front, direction) > 0.0, 1, 0)
 
 
-# Direction k of so many on a spiral from pole to pole, evenly over the sphere.
+# Direction k of `count`, unit, on a spiral from pole to pole that covers the sphere evenly.
 @wp.func
 def spiral_direction(k: wp.int32, count: wp.int32) -> wp.vec3:
     y = 1.0 - (2.0 * wp.float32(k) + 1.0) / wp.float32(count)
@@ -54,14 +54,14 @@ def spiral_direction(k: wp.int32, count: wp.int32) -> wp.vec3:
     return wp.vec3(across * wp.cos(angle), y, across * wp.sin(angle))
 
 
-# What a point sees all around it.
+# What a point sees in all directions.
 @wp.struct
 class Outlook:
     back: wp.float32  # share of directions that meet the back of a triangle
     nearest: wp.float32  # metres to the nearest front
-    towards: wp.vec3
-    nearest_back: wp.float32
-    towards_back: wp.vec3
+    towards: wp.vec3  # unit direction of the nearest front
+    nearest_back: wp.float32  # metres to the nearest back
+    towards_back: wp.vec3  # unit direction of the nearest back
 
 
 @wp.func
@@ -84,8 +84,9 @@ def look_around(scene: SceneData, at: wp.vec3, directions: wp.int32) -> Outlook:
     return r
 
 
-# Thread: a direction from a point. Sets the mean over the channels of the light that a path finds there, all of it;
-# -1 where it meets the back of a triangle.
+# Thread: a direction from a point, item `point * directions + direction` of `light`. Writes the radiance that a path
+# finds there, W/(m^2 sr), as the mean over the channels; -1 where it meets the back of a triangle. `points` are
+# [point] in metres; `sky_probability` is that of PathSettings, in [0, 1].
 @wp.kernel
 def measure_light(
     first: wp.int32,
@@ -120,8 +121,9 @@ def measure_light(
     light[i] = (total[0] + total[1] + total[2]) / 3.0
 
 
-# Thread: a path from the camera through a random point of the picture, by the BSDF. Sets the points that it meets,
-# [path * REACH_VERTICES], and 1 for each that there is.
+# Thread: a path from the camera through a random point of the picture, by the BSDF. Writes the points that it meets,
+# in metres, to its own items of `points`, [path * REACH_VERTICES], and 1 to those of `found` for each that it meets;
+# the others keep the 0 that the caller set.
 @wp.kernel
 def follow_paths(
     first: wp.int32,
@@ -153,8 +155,9 @@ def follow_paths(
         origin = ray_origin(s)
 
 
-# Thread: a probe. Moves it out of what it is inside of, or away from a wall that is too near, by at most `most` along
-# each axis: through the nearest back face, or straight away from the nearest front.
+# Thread: a probe. Moves it out of what it is inside of, through the nearest back face, or away from a front face that
+# is nearer than `clearance` (metres). It moves by at most `most` (metres) along each axis, and tries `directions` of
+# them at each place. Writes its own item of `field.positions`; nothing else in `field` is read or written.
 @wp.kernel
 def place_probes(
     first: wp.int32, scene: SceneData, field: LightField, most: wp.vec3, clearance: wp.float32, directions: wp.int32

@@ -67,14 +67,14 @@ RAYS_PROBES = wp.constant(1)
 class ProbeQuery:
     mode: wp.int32  # MODE_*
     through: wp.int32  # RAYS_*: what rays are traced through
-    visibility: wp.int32  # VISIBILITY_*: who tells which probes see a point
-    rays: wp.int32  # of the current camera sample
-    first_ray: wp.int32  # of the current camera sample, among those of the pixel
-    ray_bits: wp.int32  # bits that count the rays of a pixel
-    unseen_rays: wp.int32  # the same three where probes do not see what the pixel shows
+    visibility: wp.int32  # VISIBILITY_*: how probes that see a point are found
+    rays: wp.int32  # rays a pixel in the current camera sample
+    first_ray: wp.int32  # number of the first of them among all rays of the pixel
+    ray_bits: wp.int32  # bits that number all rays of a pixel
+    unseen_rays: wp.int32  # this and the next two: the same where too few probes see the pixel's surface
     first_unseen_ray: wp.int32
     unseen_ray_bits: wp.int32
-    paths: PathSettings  # of paths that go on where no probe sees a point
+    paths: PathSettings  # settings of paths that go on where no probe sees a point
 
 
 # Sums over samples, [height * width].
@@ -83,17 +83,17 @@ class ProbeBuffers:
     indirect: wp.array(dtype=wp.vec3)
     moment1: wp.array(dtype=wp.vec3)
     moment2: wp.array(dtype=wp.vec3)
-    diffuse: wp.array(dtype=wp.vec3)  # light as the diffuse lobe receives it, for a denoiser; or empty
-    glossy: wp.array(dtype=wp.vec3)  # what the glossy lobe reflects
+    diffuse: wp.array(dtype=wp.vec3)  # light that the diffuse lobe receives, for a denoiser; empty if there is none
+    glossy: wp.array(dtype=wp.vec3)  # light that the glossy lobe reflects, for a denoiser; empty if there is none
 
 
-# Sums over camera samples, [height * width], of a picture that is all seen through probes.
+# Sums over camera samples, [height * width], of a picture whose camera rays go through probes.
 @wp.struct
 class ProbeView:
     emission: wp.array(dtype=wp.vec3)
     indirect: wp.array(dtype=wp.vec3)
     normal: wp.array(dtype=wp.vec3)
-    position: wp.array(dtype=wp.vec3)  # this and the following: of the first camera sample
+    position: wp.array(dtype=wp.vec3)  # this and the next three: of the first camera sample alone
     depth: wp.array(dtype=wp.float32)
     object_id: wp.array(dtype=wp.int32)
     material_id: wp.array(dtype=wp.int32)
@@ -101,7 +101,7 @@ class ProbeView:
     moment2: wp.array(dtype=wp.vec3)
 
 
-# What surfaces reflect towards `origin` from a direction, as far as the maps of the probes know.
+# Radiance that surfaces in a direction reflect towards `origin`, as far as the probes' maps know.
 @wp.func
 def reflected_radiance(field: LightField, origin: wp.vec3, direction: wp.vec3) -> wp.vec3:
     hit = march(field, origin, direction, 0.0, float(wp.inf), MOST_STEPS)
@@ -110,15 +110,15 @@ def reflected_radiance(field: LightField, origin: wp.vec3, direction: wp.vec3) -
     return unpack_radiance(field.radiance[hit.probe * field.resolution * field.resolution + hit.texel])
 
 
-# Light of a sample, apart for a denoiser.
+# Light of a sample, in two parts for a denoiser.
 @wp.struct
 class Lobes:
-    diffuse: wp.vec3  # as it comes in
-    glossy: wp.vec3  # as it goes out
+    diffuse: wp.vec3  # light as the diffuse lobe receives it: without its colour
+    glossy: wp.vec3  # light as the glossy lobe reflects it
 
 
-# Light that irradiance gives a surface: to its diffuse lobe, and in the mode without rays to the glossy one as if that
-# were Lambert too.
+# Light that a surface has from irradiance: its diffuse lobe's, and in the mode without rays the glossy lobe's, as if
+# that were Lambert too.
 @wp.func
 def steady_light(irradiance: wp.vec3, s: Surface, mode: wp.int32) -> Lobes:
     r = Lobes()
@@ -143,7 +143,7 @@ def ray_direction(s: Surface, wo: wp.vec3, mode: wp.int32, index: wp.uint32, see
     return bsdf_sample(s.bsdf, wo, u_lobe, u)
 
 
-# Shares of both lobes in the light that a direction brings. A ray of the mode "hybrid" is all of the glossy lobe's; one
+# Parts of both lobes in the light of a ray. A ray of the mode "hybrid" is all of the glossy lobe's; one
 # of the mode "traced" was drawn from both: weight = f cos / pdf, of which the diffuse lobe has
 # (1 - F) cos / (pi pdf) times its colour.
 @wp.func
@@ -160,15 +160,15 @@ def lobes_of(s: Surface, wo: wp.vec3, sample: BsdfSample, light: wp.vec3, mode: 
     return r
 
 
-# Whether a sample goes by what the probes say of a point, or by a ray from there: by a random number, so that there is
-# no edge between where they are trusted and where they are not.
+# Whether a sample takes its light from the probes, or from a ray. A random number decides, so that there is no edge
+# between points where probes are trusted and points where they are not.
 @wp.func
 def trusts(seen: SeenLight, index: wp.uint32, seed: wp.uint32, dimension: wp.int32) -> wp.bool:
     return seen.trust >= 1.0 or random_1d(index, seed, dimension) < seen.trust
 
 
-# What a surface that a ray meets reflects against the ray: its direct light, sampled, and what the probes know; or a
-# path goes on from there.
+# Radiance that a surface which a ray meets reflects back along it: direct light, which is sampled, and the probes'
+# irradiance; where they know nothing, a path goes on from there.
 @wp.func
 def reflected_light(
     scene: SceneData,
@@ -192,7 +192,7 @@ def reflected_light(
     return known + light.environment + light.emitters + light.indirect
 
 
-# Light of one ray of a pixel.
+# Light that one ray of a pixel brings.
 @wp.func
 def ray_light(
     scene: SceneData,
@@ -218,8 +218,8 @@ def ray_light(
     return lobes_of(s, wo, sample, reflected_light(scene, field, query, hit, -wi, index, seed), mode)
 
 
-# Light of one sample of a pixel: what the probes say and, if the mode `traces`, that of a ray; or a ray of the whole
-# BSDF instead of both, where too few probes see the point.
+# Light of one sample of a pixel: that of the probes' irradiance and, if the mode `traces`, that of a ray. Where too few
+# probes see the point, a ray by the whole BSDF stands for both.
 @wp.func
 def sample_light(
     scene: SceneData,
@@ -248,7 +248,7 @@ def sample_light(
     return light
 
 
-# Rays of a pixel in the current camera sample, the first of them, and the bits that count those of the pixel.
+# Number of a pixel's rays in the current camera sample, the number of the first, and the bits that number all.
 @wp.func
 def ray_numbers(query: ProbeQuery, trust: wp.float32, traces: wp.bool) -> wp.vec3i:
     if trust < 1.0:
@@ -256,7 +256,7 @@ def ray_numbers(query: ProbeQuery, trust: wp.float32, traces: wp.bool) -> wp.vec
     return wp.vec3i(wp.where(traces, query.rays, 0), query.first_ray, query.ray_bits)
 
 
-# Thread: a pixel.
+# Thread: a pixel. Adds the indirect light of the current camera sample to its own items of `buffers`.
 @wp.kernel
 def trace_probes(
     first: wp.int32,
@@ -330,7 +330,7 @@ def count_probes(
         counts[pixel] = wp.where(seen.trust >= 1.0, wp.max(seen.probes, 1), 0)
 
 
-# What the sky sends against a direction, from the first probe that sees it there.
+# Radiance of the sky in a direction, from the first probe that sees it there.
 @wp.func
 def sky_radiance(field: LightField, direction: wp.vec3) -> wp.vec3:
     texel = octahedral_texel(octahedral_encode(direction), field.resolution)
@@ -341,7 +341,7 @@ def sky_radiance(field: LightField, direction: wp.vec3) -> wp.vec3:
     return wp.vec3(0.0, 0.0, 0.0)
 
 
-# Thread: a pixel. What the camera sees of the probes' surfels and of the sky behind them.
+# Thread: a pixel. Adds what the camera sees of the probes' surfels, and of the sky behind them, to `view`.
 @wp.kernel
 def view_probes(first: wp.int32, camera: CameraData, settings: PassSettings, field: LightField, view: ProbeView):
     p = tiled_pixel(first + wp.tid(), camera.width)

@@ -34,13 +34,13 @@ class Octree:
 @wp.struct
 class OctreeNodes:
     nodes: wp.array(dtype=wp.uint32)  # [node] Octree.nodes
-    prefixes: wp.array(dtype=wp.uint32)  # [node] lowest code of its cell
-    levels: wp.array(dtype=wp.int32)  # [node] 0 is the root's
-    parents: wp.array(dtype=wp.int32)  # [node] 8 parent + octant, -1 of the root
+    prefixes: wp.array(dtype=wp.uint32)  # [node] lowest code of a point in its cell
+    levels: wp.array(dtype=wp.int32)  # [node] level of its cell; the root has 0
+    parents: wp.array(dtype=wp.int32)  # [node] 8 * parent + octant; -1 for the root
     previous: wp.array(dtype=wp.int32)  # [node] the same cell's node in the previous tree; or -1 - its leaf there
-    inner: wp.array(dtype=wp.int32)  # [node] inner children, then their running sum within a level
-    starts: wp.array(dtype=wp.int32)  # [8 node + octant] first sample of the cell
-    counts: wp.array(dtype=wp.int32)  # [8 node + octant] samples in it
+    inner: wp.array(dtype=wp.int32)  # [node] number of inner children, then their running sum within a level
+    starts: wp.array(dtype=wp.int32)  # [8 * node + octant] first sample in the child's cell
+    counts: wp.array(dtype=wp.int32)  # [8 * node + octant] number of samples in the child's cell
 
 
 # Every third bit of ten, for Morton codes.

@@ -41,26 +41,26 @@ LARGEST_FLOAT = wp.constant(wp.float32(3.402823466e38))
 @wp.struct
 class QuadtreeSamples:
     starts: wp.array(dtype=wp.int32)  # [leaf] first of its records in `order`
-    counts: wp.array(dtype=wp.int32)  # [leaf] how many
+    counts: wp.array(dtype=wp.int32)  # [leaf] number of its records
     order: wp.array(dtype=wp.int32)  # record indices
-    codes: wp.array(dtype=wp.uint32)  # [record] cell of the point
+    codes: wp.array(dtype=wp.uint32)  # [record] octree code of the point's cell
     directions: wp.array(dtype=wp.uint32)  # [record] quadtree_pack_direction
-    contributions: wp.array(dtype=wp.float32)  # [record] below 0: no sample
+    contributions: wp.array(dtype=wp.float32)  # [record] luminance; below 0: no sample
     pdfs: wp.array(dtype=wp.float32)  # [record] 1/sr
 
 
 @wp.struct
 class QuadtreeAdaptation:
     bits: wp.int32  # 32, 64, 96 or 128
-    migrations: wp.int32  # most a frame
-    significance: wp.float32  # what a leaf gains, times this, must exceed what is lost by the children given up
+    migrations: wp.int32  # largest number of leaves that move in a frame
+    significance: wp.float32  # gain of a split times this must exceed the loss of a merge
     fading: wp.float32  # share that energies keep from frame to frame
-    most_samples: wp.int32  # a leaf; taken evenly from its range
+    most_samples: wp.int32  # largest number of samples of a leaf; taken evenly from its range
     trees: wp.array(dtype=wp.vec4ui)  # [leaf] in and out
     counts: wp.array(dtype=wp.uint32)  # [leaf * bits / 4] out: quadtree_counts
     anchors: wp.array(dtype=wp.vec4)  # [leaf] see parallax.py
     octree: Octree
-    energies: wp.array(dtype=wp.float32)  # [leaf * 4 * bits] in and out: of each quadrant of each node
+    energies: wp.array(dtype=wp.float32)  # [leaf * 4 * bits] in and out: squared light in each quadrant of each node
 
 
 # Octahedral coordinates of a direction, 16 bits each, x in the low half.
@@ -80,7 +80,7 @@ def quadtree_unpack_direction(code: wp.uint32) -> wp.vec3:
     return octahedral_decode(wp.vec2(x, y))
 
 
-ENOUGH_SAMPLES = wp.constant(256)  # of fewer samples, what was known fades less
+ENOUGH_SAMPLES = wp.constant(256)  # number of samples below which earlier frames fade less
 
 
 # Density over the unit square of octahedral coordinates, of one over the sphere; see octahedral_density.
@@ -145,14 +145,14 @@ def energy_of_children(energies: wp.array(dtype=wp.float32), base: wp.int32, chi
     )
 
 
-# A leaf, and what there is to gain by splitting it.
+# A leaf, and the gain of splitting it.
 @wp.struct
 class Leaf:
     node: wp.int32  # -1: there is none
     gain: wp.float32
 
 
-# The leaf that gains most by being split, among those that may be; the first of equals.
+# The leaf whose split gains most, among those that may be split; the first of equals.
 @wp.func
 def brightest_leaf(tree: wp.vec4ui, bits: wp.int32, energies: wp.array(dtype=wp.float32), base: wp.int32) -> Leaf:
     best = Leaf()
@@ -172,14 +172,14 @@ def brightest_leaf(tree: wp.vec4ui, bits: wp.int32, energies: wp.array(dtype=wp.
     return best
 
 
-# What is lost if the children of inner node k, the first of which is `child`, are given up for one leaf.
+# Inner node k whose four children, the first of which is `child`, are leaves, and the loss of merging them.
 @wp.struct
 class Twig:
     node: wp.int32  # -1: there is none
     loss: wp.float32
 
 
-# The inner node with only leaves as children, but not `leaf`, that loses least without them; the first of equals.
+# The inner node whose merge loses least, among those with only leaves as children, `leaf` not among them.
 @wp.func
 def darkest_twig(
     tree: wp.vec4ui, bits: wp.int32, energies: wp.array(dtype=wp.float32), base: wp.int32, leaf: wp.int32
@@ -210,7 +210,7 @@ def darkest_twig(
     return best
 
 
-# Moves energies to where quadtree_migrate moves nodes. A new leaf has what was there, as fine as it is known.
+# Moves energies to where quadtree_migrate moves nodes. A new leaf gets the energy that was known at its place.
 @wp.func
 def migrate_energies(
     energies: wp.array(dtype=wp.float32),
@@ -237,7 +237,7 @@ def migrate_energies(
         energies[base + 4 * inserted + i] = 0.25 * split[i >> 2]
 
 
-# A thread is a leaf of the octree, and adapts its quadtree.
+# Thread: a leaf of the octree. Adapts its quadtree, and writes its own items of `trees`, `counts` and `energies`.
 @wp.kernel
 def adapt_quadtrees(first: wp.int32, samples: QuadtreeSamples, adaptation: QuadtreeAdaptation):
     item = first + wp.tid()

@@ -30,21 +30,21 @@ from warp_gi.kernels.types import SceneData
 wp.set_module_options({"enable_backward": False})
 
 
-# What rays through the middles of pixels meet, [item].
+# What rays through the middles of pixels meet, [item]; each thread writes its own item.
 @wp.struct
 class LeafView:
-    leaves: wp.array(dtype=wp.int32)  # of the octree; -1: no surface
-    origins: wp.array(dtype=wp.vec3)  # where rays leave the surface
+    leaves: wp.array(dtype=wp.int32)  # leaf of the octree; -1: no surface
+    origins: wp.array(dtype=wp.vec3)  # points from which rays leave the surface, metres
     normals: wp.array(dtype=wp.vec3)  # geometric, unit, towards the camera
 
 
-# An octahedral map of what comes to a point.
+# An octahedral map of the light that comes to a point.
 @wp.struct
 class IncidentMap:
     origin: wp.vec3
     normal: wp.vec3  # directions below the surface get 0
     resolution: wp.int32
-    rays: wp.int32  # of a texel, anywhere in it
+    rays: wp.int32  # rays of a texel, anywhere in it
     seed: wp.uint32
     max_depth: wp.int32  # edges of the longest path that is seen, that to the point included; below 2: none
     roulette_depth: wp.int32  # edges from which paths end at random, that to the point included
@@ -53,7 +53,7 @@ class IncidentMap:
     light: wp.array(dtype=wp.float32)  # [resolution^2] luminance of the mean radiance
 
 
-# Thread: a pixel, the first of which is number `begin`, row by row.
+# Thread: a pixel; item 0 is pixel number `begin`, row by row.
 @wp.kernel
 def view_leaves(first: wp.int32, scene: SceneData, camera: CameraData, begin: wp.int32, octree: Octree, view: LeafView):
     item = first + wp.tid()
@@ -69,7 +69,7 @@ def view_leaves(first: wp.int32, scene: SceneData, camera: CameraData, begin: wp
         view.normals[item] = s.normal
 
 
-# Luminance that comes to the point from a direction.
+# Luminance of the radiance that comes to the point from a direction.
 @wp.func
 def incident_luminance(scene: SceneData, incident: IncidentMap, direction: wp.vec3, index: wp.uint32) -> wp.float32:
     if wp.dot(direction, incident.normal) <= 0.0:
@@ -89,7 +89,7 @@ def incident_luminance(scene: SceneData, incident: IncidentMap, direction: wp.ve
     return luminance(path.environment + path.emitters + path.indirect)
 
 
-# Thread: a texel.
+# Thread: a texel. Writes the mean luminance of the light that comes from its directions.
 @wp.kernel
 def map_incident_light(first: wp.int32, scene: SceneData, incident: IncidentMap):
     texel = first + wp.tid()
@@ -105,8 +105,8 @@ def map_incident_light(first: wp.int32, scene: SceneData, incident: IncidentMap)
     incident.light[texel] = total / wp.float32(incident.rays)
 
 
-# Thread: a pixel of an octahedral map. The density [1/sr] of the direction in its middle, of a region's tree at a
-# position, and the quadtree's leaf.
+# Thread: a pixel of an octahedral map. Writes the density [1/sr] that a region's tree has at a position in the
+# direction of the pixel's middle, and the node of the quadtree's leaf there.
 @wp.kernel
 def map_quadtree(
     first: wp.int32,

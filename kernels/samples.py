@@ -19,23 +19,23 @@ from warp_gi.kernels.types import SceneData
 wp.set_module_options({"enable_backward": False})
 
 LIGHT_VISIBLE = wp.constant(wp.uint32(1 << 31))
-LIGHT_BLOCKED = wp.constant(wp.uint32(1 << 30))  # something is in between
+LIGHT_BLOCKED = wp.constant(wp.uint32(1 << 30))  # something is between the point and the light
 SURFACE_GLOSSY = wp.constant(wp.uint32(1 << 29))
 LIGHT_EXPLORED = wp.constant(wp.uint32(1 << 28))
 LIGHT_ALONE = wp.constant(wp.uint32(1 << 27))  # LightChoice.alone
-LIGHT_ITEM = wp.constant(wp.uint32((1 << 27) - 1))  # emitter + 1; 0: none was sampled
+LIGHT_ITEM = wp.constant(wp.uint32((1 << 27) - 1))  # mask of emitter + 1; 0: no light was sampled
 GLOSSY_ALPHA = wp.constant(wp.float32(0.2))  # GGX alpha below which a surface counts as glossy
 NO_DIRECTION = wp.constant(wp.float32(-1.0))
 LEAST_PROBABILITY = wp.constant(wp.float32(1.0e-12))
 
 
-# Which of the two kinds of surfaces of a region, that learn a share of the BSDF each.
+# Kind of a surface, 1 if glossy; a region learns a share of the BSDF for each of the two kinds.
 @wp.func
 def is_glossy(b: Bsdf) -> wp.bool:
     return b.f90 > 0.0 and b.alpha < GLOSSY_ALPHA
 
 
-# Share of one of two strategies in the density of a sample, and the share with which it is asked, 16 bits each.
+# Part of one of two strategies in the density of a sample, and the probability of using it, 16 bits each.
 @wp.func
 def pack_mixture(posterior: wp.float32, share: wp.float32) -> wp.uint32:
     low = wp.uint32(wp.clamp(posterior, 0.0, 1.0) * 65535.0 + 0.5)
@@ -50,7 +50,7 @@ def mixture_densities(word: wp.uint32) -> wp.vec2:
     return wp.vec2(posterior / share, (1.0 - posterior) / (1.0 - share))
 
 
-# Samples by slot.
+# Samples of a frame, [slot]. The path that owns a slot writes it; kernels that learn only read.
 @wp.struct
 class SampleRecords:
     codes: wp.array(dtype=wp.uint32)  # octree cell of the point; EMPTY_CODE: no sample
@@ -60,12 +60,12 @@ class SampleRecords:
     # much the second moment of both choices together exceeds that of exploring alone.
     rivals: wp.array(dtype=wp.float32)
     directions: wp.array(dtype=wp.uint32)  # quadtree_pack_direction
-    contributions: wp.array(dtype=wp.float32)  # luminance reflected of what came that way, but for emitters it hit
-    pdfs: wp.array(dtype=wp.float32)  # 1/sr, of the direction
-    carried: wp.array(dtype=wp.float32)  # throughput of the path up to the vertex
-    nearness: wp.array(dtype=wp.float32)  # 1/m, of the point it hit; 0: the sky
+    contributions: wp.array(dtype=wp.float32)  # luminance of light reflected from there, without emitters it hit
+    pdfs: wp.array(dtype=wp.float32)  # density of the direction, 1/sr
+    carried: wp.array(dtype=wp.float32)  # luminance of the path's throughput up to the vertex
+    nearness: wp.array(dtype=wp.float32)  # one over the distance to the point that the ray hit, 1/m; 0: the sky
     mixtures: wp.array(dtype=wp.uint32)  # pack_mixture of the BSDF
-    vertices: wp.int32  # slots of a path
+    vertices: wp.int32  # number of slots of a path
     stride: wp.int32
     seed: wp.uint32
 
@@ -73,10 +73,10 @@ class SampleRecords:
 # Samples by leaf.
 @wp.struct
 class LeafSamples:
-    starts: wp.array(dtype=wp.int32)  # [leaf] first in `order`
-    counts: wp.array(dtype=wp.int32)  # [leaf]
+    starts: wp.array(dtype=wp.int32)  # [leaf] first of its samples in `order`
+    counts: wp.array(dtype=wp.int32)  # [leaf] number of its samples
     order: wp.array(dtype=wp.int32)  # slots, leaf by leaf
-    most: wp.int32  # samples that are looked at in one leaf, evenly spread
+    most: wp.int32  # largest number of samples that are looked at in a leaf, evenly spread
 
 
 @wp.struct
@@ -86,7 +86,7 @@ class SampleRegions:
     moves: wp.int32  # 1: points may have been elsewhere in the previous frame
 
 
-# Leaf of what was learnt about a point: at its place in the previous frame, from which the samples are.
+# Leaf that knows about a point: the one at its place in the previous frame, in which samples were taken.
 @wp.func
 def sample_region(
     data: SampleRegions, scene: SceneData, s: Surface, face: wp.int32, u: wp.float32, v: wp.float32

@@ -27,7 +27,7 @@ from warp_gi.kernels.types import Bvh
 
 wp.set_module_options({"enable_backward": False})
 
-VISIBLE = wp.constant(1)  # bits of a texel
+VISIBLE = wp.constant(1)  # bit of a texel: some sample saw the sky; and the next: some sample did not
 OCCLUDED = wp.constant(2)
 TEXELS_A_WORD = wp.constant(16)
 SLOT_BITS = wp.constant(0x1FFFFFFF)
@@ -47,17 +47,17 @@ vec6 = wp.types.vector(length=6, dtype=wp.float32)
 @wp.struct
 class VisibilityGrid:
     low: wp.vec3  # corner of cell 0, metres
-    cell_size: wp.float32
-    nx: wp.int32
+    cell_size: wp.float32  # metres
+    nx: wp.int32  # cells along x; and the next two along y and z
     ny: wp.int32
     nz: wp.int32
     resolution: wp.int32  # texels along a side of a map
-    words: wp.int32  # of a cell's map
-    slots: wp.array(dtype=wp.int32)  # [cell], x fastest: where in `masks`, with SLOT_* flags; -1 is not baked
+    words: wp.int32  # 32-bit words of a cell's map
+    slots: wp.array(dtype=wp.int32)  # [cell], x fastest: slot in `masks` with SLOT_* flags; -1: not baked
     masks: wp.array(dtype=wp.uint32)  # [slot * words] two bits a texel
 
 
-# What runs beside the grid: who may not use it, and what helps to trace what it leaves over.
+# What goes with a grid into kernels: how it is used, samples, boxes of movers, and hints for the rays that are traced.
 @wp.struct
 class FieldQuery:
     mode: wp.int32  # MODE_*
@@ -65,8 +65,8 @@ class FieldQuery:
     cosines: wp.array2d(dtype=wp.float32)  # [3, sets * set_size + 8] cosine-weighted directions about +z, set by set
     set_size: wp.int32
     set_count: wp.int32
-    hints: wp.array(dtype=wp.int32)  # [power of two] for hinted_occluded; empty to do without
-    boxes: wp.array(dtype=wp.vec3)  # [2 * box] low and high corner of what moves
+    hints: wp.array(dtype=wp.int32)  # [power of two] for hinted_occluded, any thread may write; empty: no hints
+    boxes: wp.array(dtype=wp.vec3)  # [2 * box] low and high corner of each object that moves, metres
     moving: wp.array(dtype=wp.int32)  # [object] 1 if cells with SLOT_BOXED do not know its surfaces; empty if none
 
 

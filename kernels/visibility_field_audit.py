@@ -25,7 +25,7 @@ from warp_gi.kernels.visibility_field import (
 wp.set_module_options({"enable_backward": False})
 
 
-# Per pixel: how many cosine-weighted rays fall in which state, and how many of the sure ones are wrong.
+# Counts of cosine-weighted rays, [pixel]: how many are in each state, and how many of the sure ones are wrong.
 @wp.struct
 class AuditBuffers:
     visible: wp.array(dtype=wp.int32)  # surely visible
@@ -34,10 +34,10 @@ class AuditBuffers:
     unknown: wp.array(dtype=wp.int32)
     lost: wp.array(dtype=wp.int32)  # called occluded, but visible
     leaked: wp.array(dtype=wp.int32)  # called visible, but occluded
-    label: wp.array(dtype=wp.int32)  # slot with flags, -1 where there is none
+    label: wp.array(dtype=wp.int32)  # slot of the pixel's cell with flags, -1 where there is none
 
 
-# Thread: a pixel. Every ray is traced.
+# Thread: a pixel. Traces every ray, and writes its own counts.
 @wp.kernel
 def audit_field(
     first: wp.int32,

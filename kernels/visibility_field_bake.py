@@ -95,12 +95,12 @@ _CLIP = """
 """
 
 
-# Square metres of the triangle in the box.
+# Area of the polygon, m^2.
 @wp.func_native(_CLIP + "return area;")
 def piece_area(p0: wp.vec3, p1: wp.vec3, p2: wp.vec3, low: wp.vec3, high: wp.vec3) -> wp.float32: ...
 
 
-# Samples on its edges at a spacing in metres, corners among them.
+# Number of samples on the polygon's edges at a spacing in metres, corners among them.
 @wp.func_native(
     _CLIP
     + """
@@ -114,7 +114,7 @@ def piece_edge_count(
 ) -> wp.int32: ...
 
 
-# A point of it, uniform in area for u and v uniform in [0, 1).
+# A point of the polygon, uniform in area for u and v uniform in [0, 1).
 @wp.func_native(
     _CLIP
     + """
@@ -136,7 +136,7 @@ def piece_point(
 ) -> wp.vec3: ...
 
 
-# Sample `index` on its edges, a thousandth of the way inside.
+# Sample `index` on the polygon's edges, a thousandth of the way inside.
 @wp.func_native(
     _CLIP
     + """
@@ -188,19 +188,19 @@ def side_triangle(geometry: Geometry, side: wp.int32, radius: wp.float32) -> Sid
     return t
 
 
-# What is looked for: pieces of sides in cells.
+# A search for pieces, the parts of sides of triangles in cells of a grid.
 @wp.struct
 class PieceSearch:
-    low: wp.vec3  # of the grid
+    low: wp.vec3  # corner of cell 0 of the grid, metres
     cell_size: wp.float32
     nx: wp.int32
     ny: wp.int32
     nz: wp.int32
-    radius: wp.float32  # of the scene, metres
-    spacing: wp.float32  # of samples on edges, metres
+    radius: wp.float32  # radius of the scene, metres
+    spacing: wp.float32  # distance between samples on edges, metres
     wanted: wp.array(dtype=wp.uint8)  # [cell] 1 where pieces are looked for
     left_out: wp.array(dtype=wp.int32)  # [object] 1 for objects that are not sampled; empty if none
-    start: wp.array(dtype=wp.int64)  # [side] where its pieces go; empty while they are counted
+    start: wp.array(dtype=wp.int64)  # [side] where the side's pieces go; empty while pieces are counted
 
 
 @wp.func
@@ -208,8 +208,8 @@ def cell_low(search: PieceSearch, x: wp.int32, y: wp.int32, z: wp.int32) -> wp.v
     return search.low + wp.vec3(wp.float32(x), wp.float32(y), wp.float32(z)) * search.cell_size
 
 
-# Thread: a side. Counts the pieces that its box may have, or writes them: cell, square metres (0 if the triangle
-# passes by) and samples on edges.
+# Thread: a side. Counts the cells that its box meets, which may hold a piece; or writes for each of them cell, area in
+# m^2 (0 if the triangle passes by) and number of samples on edges.
 @wp.kernel
 def find_pieces(
     first: wp.int32,
@@ -252,12 +252,12 @@ class CellSurfaces:
     search: PieceSearch
     seed: wp.uint32
     cell: wp.array(dtype=wp.int32)  # [slot] number in the grid
-    piece_start: wp.array(dtype=wp.int32)  # [slot + 1]
-    side: wp.array(dtype=wp.int32)  # [piece]
-    area: wp.array(dtype=wp.float32)  # [piece] cumulative in the cell
+    piece_start: wp.array(dtype=wp.int32)  # [slot + 1] first piece of each cell, and the number of pieces
+    side: wp.array(dtype=wp.int32)  # [piece] number of the side: 2 * triangle + side
+    area: wp.array(dtype=wp.float32)  # [piece] area, m^2, cumulative in the cell
     edges: wp.array(dtype=wp.int32)  # [piece] samples on edges, cumulative in the cell
     area_count: wp.array(dtype=wp.int32)  # [slot] samples by area; those on edges come after them
-    step: wp.array(dtype=wp.int32)  # [slot] without a divisor in common with area_count
+    step: wp.array(dtype=wp.int32)  # [slot] step between samples, without a divisor in common with area_count
 
 
 @wp.struct
@@ -267,8 +267,8 @@ class SurfaceSample:
     hash: wp.uint32
 
 
-# Sample k of a cell. Those by area are stratified over its pieces, and taken in steps of a golden section of their
-# number, so that the first few are spread over all of them.
+# Sample k of a cell. Samples by area are stratified over the cell's pieces, and taken in steps of a golden section of
+# their number, so that the first few are spread over all pieces.
 @wp.func
 def surface_sample(geometry: Geometry, cells: CellSurfaces, slot: wp.int32, k: wp.int32) -> SurfaceSample:
     cell = cells.cell[slot]
@@ -321,12 +321,13 @@ class BakeChunks:
     slot: wp.array(dtype=wp.int32)
     begin: wp.array(dtype=wp.int32)
     end: wp.array(dtype=wp.int32)
-    rays: wp.int32  # a sample, a multiple of 8
+    rays: wp.int32  # rays of a sample, a multiple of 8
     partial: wp.array(dtype=wp.uint32)  # [chunk * words] masks of each chunk
     traced: wp.array(dtype=wp.int32)  # [chunk] rays that were traced
 
 
-# Thread: a chunk. Bit 0 of `settled` marks texels that are settled, bit 1 those that are quiet.
+# Thread: a chunk. Writes its own masks and count to `chunks.partial` and `chunks.traced`. In `settled`, which it only
+# reads, bit 0 marks texels that are settled, bit 1 texels that are quiet.
 @wp.kernel
 def bake_masks(
     first: wp.int32,
@@ -375,19 +376,20 @@ class MergeCells:
     chunk_start: wp.array(dtype=wp.int32)  # [slot + 1] chunks of this round by slot
     partial: wp.array(dtype=wp.uint32)
     raw: wp.array(dtype=wp.uint32)  # [slot * words] OR of all samples so far, not dilated
-    masks: wp.array(dtype=wp.uint32)  # [slot * words] dilated
-    settled: wp.array(dtype=wp.uint32)  # [slot * words]
-    neighbors: wp.array(dtype=wp.int32)  # [texel * neighbor_count] texels that one dilates to, itself among them
+    masks: wp.array(dtype=wp.uint32)  # [slot * words] `raw`, dilated
+    settled: wp.array(dtype=wp.uint32)  # [slot * words] two bits a texel: settled, quiet
+    neighbors: wp.array(dtype=wp.int32)  # [texel * neighbor_count] texels that a texel dilates to, itself among them
     neighbor_count: wp.int32
-    quiet_neighbors: wp.array(dtype=wp.int32)  # [texel * quiet_count] one texel further
+    quiet_neighbors: wp.array(dtype=wp.int32)  # [texel * quiet_count] the same, one texel further
     quiet_count: wp.int32
     resolution: wp.int32
     words: wp.int32
-    flags: wp.array(dtype=wp.int32)  # [slot] SLOT_LABEL by Eq. 7 and 8
-    last: wp.int32  # 1 in the last round, after which nobody asks what is settled
+    flags: wp.array(dtype=wp.int32)  # [slot] SLOT_LABEL or 0, by Eq. 7 and 8
+    last: wp.int32  # 1 in the last round, which need not find what is settled
 
 
-# Thread: a cell. ORs the chunks of a round into it, dilates, labels, and finds what is settled or quiet.
+# Thread: a cell. ORs the chunks of a round into its masks, dilates them, labels the cell, and finds texels that are
+# settled or quiet. Writes its own slot of `raw`, `masks`, `settled` and `flags`.
 @wp.kernel
 def merge_masks(first: wp.int32, cells: MergeCells):
     slot = first + wp.tid()
@@ -442,7 +444,7 @@ def merge_masks(first: wp.int32, cells: MergeCells):
         cells.settled[start + word] = done
 
 
-# Thread: a block of 2 x 2 pixels, of which it looks at number `corner`. The cell of what that pixel sees, -1 for none.
+# Thread: a block of 2 x 2 pixels. Writes the cell of the surface that pixel number `corner` of it sees; -1: none.
 @wp.kernel
 def find_cells(
     first: wp.int32,

@@ -66,20 +66,20 @@ SKY_HARMONIC = wp.constant(1)
 SKY_MAP = wp.constant(2)
 
 
-# The sky as this estimator sees it.
+# The sky as visibility fields sample it.
 @wp.struct
 class FieldSky:
     kind: wp.int32  # SKY_*
-    radiance: wp.vec3  # of SKY_CONSTANT
-    harmonics: Harmonics  # of SKY_HARMONIC; W/(m^2 sr)
+    radiance: wp.vec3  # radiance of SKY_CONSTANT, W/(m^2 sr)
+    harmonics: Harmonics  # coefficients of SKY_HARMONIC, W/(m^2 sr)
     set_size: wp.int32  # samples in a set
     set_count: wp.int32  # a power of two
-    directions: wp.array(dtype=wp.vec3)  # [set * set_size] towards the sky
-    radiances: wp.array(dtype=wp.vec3)
-    pdfs: wp.array(dtype=wp.float32)  # 1/sr; 0 if there is nothing to sample
+    directions: wp.array(dtype=wp.vec3)  # [set * set_size] unit, towards the sky
+    radiances: wp.array(dtype=wp.vec3)  # [set * set_size] W/(m^2 sr)
+    pdfs: wp.array(dtype=wp.float32)  # [set * set_size] 1/sr; 0 if there is nothing to sample
 
 
-# All that a frame asks for its light.
+# All that a frame needs of a field.
 @wp.struct
 class Field:
     grid: VisibilityGrid
@@ -87,24 +87,24 @@ class Field:
     sky: FieldSky
 
 
-# Sums over samples, [height * width].
+# Sums over samples, [height * width]; each thread adds to its own pixel's.
 @wp.struct
 class FieldBuffers:
     environment: wp.array(dtype=wp.vec3)
-    moment1: wp.array(dtype=wp.vec3)  # of the samples of this term
+    moment1: wp.array(dtype=wp.vec3)  # sums of the samples of this term; and the next: of their squares
     moment2: wp.array(dtype=wp.vec3)
     transfer: wp.array(dtype=wp.float32)  # [pixel * 27] what each harmonic of a sky adds to red, green, blue; or empty
 
 
-# What one pixel asks with.
+# A pixel: where its rays start, its cell, and its samples.
 @wp.struct
 class FieldPixel:
     index: wp.int32
     origin: wp.vec3
     slot: wp.int32
-    set: wp.int32  # of cosine directions, the first it takes
-    turn: wp.float32  # of that set about the normal, in [0, 1)
-    index_base: wp.uint32  # of glossy samples in the path tracer's sequence, and the seed that goes with it
+    set: wp.int32  # first set of cosine directions that it takes
+    turn: wp.float32  # turn of that set about the normal, in [0, 1)
+    index_base: wp.uint32  # glossy samples in the path tracer's sequence; and the next: their seed
     index_seed: wp.uint32
     seed: wp.uint32
     first: wp.int32
@@ -138,7 +138,8 @@ def sure_visibility(
     return -1
 
 
-# How much of the sky comes through: 0 or 1, or what makes up for all that were not verified where a sure ray was wrong.
+# Share of the sky's light that comes through: 0 or 1; where a sure ray that was verified is wrong, a number that makes
+# up for the wrong ones that were not verified.
 @wp.func
 def sky_visibility(
     scene: SceneData,
@@ -212,7 +213,7 @@ def weighted_sky(scene: SceneData, sky: FieldSky, direction: wp.vec3, pdf: wp.fl
     return sky.radiance
 
 
-# Adds `factor` times the light of the lanes in `bits`, as a Lambert surface of albedo 1 reflects it.
+# Adds to `sums` `factor` times the light of the lanes in `bits`, as a Lambert surface of albedo 1 reflects it.
 @wp.func
 def add_lanes(
     scene: SceneData, sky: FieldSky, octet: vec33, bits: wp.int32, factor: wp.float32, normal: wp.vec3, sums: FieldSums
@@ -249,8 +250,8 @@ def add_transfer(transfer: vec9, octet: vec33, bits: wp.int32, factor: wp.float3
     return r
 
 
-# BSDF samples of a Lambert surface, eight at a time. Adds to `sums`, per unit of albedo, and where the frame keeps
-# transfers, to those of the pixel.
+# BSDF samples of a Lambert surface, eight at a time. Adds their light per unit of albedo to `sums`, and to the pixel's
+# transfers where the frame keeps them.
 @wp.func
 def lambert_samples(
     scene: SceneData,
@@ -394,7 +395,7 @@ def light_samples(
     return r
 
 
-# Thread: a pixel. Adds the sky's light on the current camera sample.
+# Thread: a pixel. Adds the sky's light on the current camera sample to its own items of `buffers`.
 @wp.kernel
 def trace_field(
     first: wp.int32,
@@ -449,7 +450,7 @@ def trace_field(
     buffers.moment2[pixel] = buffers.moment2[pixel] + sums.bsdf_square + sums.light_square + both
 
 
-# Thread: a light sample of the sky.
+# Thread: a light sample. Draws it from the sky map, and writes its own items of `sky`.
 @wp.kernel
 def sample_sky(first: wp.int32, scene: SceneData, seed: wp.uint32, sky: FieldSky):
     k = first + wp.tid()
@@ -461,7 +462,7 @@ def sample_sky(first: wp.int32, scene: SceneData, seed: wp.uint32, sky: FieldSky
     sky.radiances[k] = e.radiance
 
 
-# Thread: a pixel. Its light under a low-frequency sky from what it transfers; no ray is traced.
+# Thread: a pixel. Writes its light under a low-frequency sky, from its transfers; no ray is traced.
 @wp.kernel
 def relight(
     first: wp.int32,

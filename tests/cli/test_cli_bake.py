@@ -23,6 +23,7 @@ from warp_gi.sequence import frames as sequence
 from warp_gi.techniques.light_field.estimator import LightFieldProbes
 from warp_gi.techniques.light_field.state import ProbeState
 from warp_gi.techniques.visibility_field import export
+from warp_gi.techniques.visibility_field import pictures as dvf_pictures
 from warp_gi.techniques.visibility_field.estimator import VisibilityField
 from warp_gi.techniques.visibility_field.state import FieldState
 
@@ -179,9 +180,10 @@ def test_show_writes_pictures(baked):
     render = np.asarray(Image.open(folder / "render.png"))
     assert render.shape == (32, 48, 3) and render.max() > 100
     shown = {tuple(color) for color in np.asarray(Image.open(folder / "maps.png")).reshape(-1, 3)}
-    assert {export.VISIBLE_COLOR, export.OCCLUDED_COLOR, export.MIXED_COLOR} <= shown
+    assert {dvf_pictures.VISIBLE_COLOR, dvf_pictures.OCCLUDED_COLOR, dvf_pictures.MIXED_COLOR} <= shown
     labels = {tuple(color) for color in np.asarray(Image.open(folder / "labels.png"))[:32, :48].reshape(-1, 3)}
-    assert export.OCCLUDED_COLOR in labels and export.UNKNOWN_COLOR not in labels  # all cells in view are baked
+    assert dvf_pictures.OCCLUDED_COLOR in labels
+    assert dvf_pictures.UNKNOWN_COLOR not in labels  # all cells in view are baked
     traced = np.asarray(Image.open(folder / "traced.png"))[:32, :48]
     assert len(np.unique(traced.reshape(-1, 3), axis=0)) > 20
 
@@ -222,7 +224,7 @@ def field_says(bake, positions, directions):
     """Return what the bake's own lookup says, as the eight bits of a texture."""
     settings = VisibilityField(cell_size=0.5, resolution=18, rays=64)
     device = wp.get_device("cpu")
-    state = FieldState.from_bake(gi.builtin_scene("cornell_box"), device, settings, 1, bake)
+    state = FieldState.from_bake(gi.builtin_scene("cornell_box"), device, settings.mask_settings, 1, bake)
     state.upload()
     found = wp.zeros(len(positions), dtype=wp.int32, device=device)
     arrays = [wp.array(values.astype(np.float32), dtype=wp.vec3, device=device) for values in (positions, directions)]
@@ -364,7 +366,7 @@ def test_the_closing_tables_say_what_was_baked(probes):
     assert float(rows["million rays a second"]) > 0 and float(rows["seconds"]) > 0
     assert float(rows["file [MB]"]) == pytest.approx(path.stat().st_size / 1e6, rel=1e-3)
     settings = LightFieldProbes(counts=(3, 2, 2), resolution=32, irradiance_resolution=8, rays=1, bounces=3)
-    state = ProbeState(gi.builtin_scene("cornell_box"), wp.get_device("cpu"), settings, 1, bake)
+    state = ProbeState(gi.builtin_scene("cornell_box"), wp.get_device("cpu"), settings.probe_settings, 1, bake)
     assert bake.counts["bytes"] == state.nbytes
     assert float(rows["maps in memory [MB]"]) == pytest.approx(state.nbytes / 1e6, rel=1e-3)
     assert rows["bounces"] == "3" and [float(rows[str(n)]) for n in (1, 2, 3)] == pytest.approx(state.changes, rel=1e-3)

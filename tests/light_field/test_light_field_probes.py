@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
+from scene_tools import light, quad, sphere
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.bench.harness.presets import light, quad, sphere
 from warp_gi.kernels import denoise as denoise_kernels
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_bake as bake_kernels
@@ -27,11 +27,11 @@ from warp_gi.techniques.light_field.places import (
     ProbeGrid,
     lit_bounds,
     lit_data,
-    map_resolution,
     place_grid,
     probe_grid,
     relocate,
 )
+from warp_gi.techniques.light_field.settings import map_resolution
 from warp_gi.techniques.light_field.state import ProbeState, low_directions
 
 wp.set_module_options({"enable_backward": False})
@@ -164,7 +164,7 @@ def dark_room_beside():
 
 
 def grid_of(scene, camera=None, **settings):
-    return place_grid(scene, gi.LightFieldProbes(**settings), camera, CPU)
+    return place_grid(scene, gi.LightFieldProbes(**settings).probe_settings, camera, CPU)
 
 
 def box_of(grid, more=0.0):
@@ -276,7 +276,7 @@ def test_probes_at_the_border_move_into_the_light():
     sides = quad((0.68, -1, -1), (0, 0, 2), (0, 2, 0), wall), quad((0.72, -1, 1), (0, 0, -2), (0, 2, 0), wall)
     scene = lamp_room(*sides)
     settings = gi.LightFieldProbes(**SMALL)
-    state = ProbeState(scene, CPU, settings, 1)
+    state = ProbeState(scene, CPU, settings.probe_settings, 1)
     grid = ProbeGrid(np.array([-0.52, -0.5, -0.5]), np.array([1.4, 1.0, 1.0]), (2, 2, 2))
     state.field.positions = wp.array(grid.positions().astype(np.float32), dtype=wp.vec3, device=CPU)
     relocate(scene, lit_data(scene, CPU), grid, state.field, CPU)
@@ -323,7 +323,7 @@ def test_filters_keep_constants():
     """Moments of a constant distance are that distance and its square; irradiance of constant light is pi times it."""
     scene = room(0.5, 1.0)
     settings = gi.LightFieldProbes(**{**SMALL, "counts": (1, 1, 1)}, bounces=1)
-    state = ProbeState(scene, CPU, settings, 1)
+    state = ProbeState(scene, CPU, settings.probe_settings, 1)
     work = state._work(np.array([0]), 1, scene, with_emission=False)
     state._trace(lit_data(scene, CPU), work, np.array([0]))
     work.light.fill_(wp.vec3(0.25, 0.5, 4.0))
@@ -367,7 +367,7 @@ def test_weights_sum_to_one(weights):
     block = sphere((0.3, -0.2, 0.1), 0.4, gi.Material("block", (0.5, 0.5, 0.5), specular=0.0))
     settings = gi.LightFieldProbes(**SMALL, weights=weights)
     scene = lamp_room(block)
-    state = ProbeState(scene, CPU, settings, 1, gi.bake(scene, settings))
+    state = ProbeState(scene, CPU, settings.probe_settings, 1, gi.bake(scene, settings))
     state.field.irradiance.fill_(wp.vec3(1.0, 2.0, 3.0))
     rng = np.random.default_rng(2)
     normals = rng.normal(size=(2000, 3))
@@ -618,7 +618,7 @@ def test_the_picture_of_who_sees_what_counts_probes():
         pipeline = gi.Pipeline(indirect=replace(settings, visibility=visibility), spp=1)
         scheduler = gi.FrameScheduler(lamp_room(block), view((32, 24)), pipeline, seed=1)
         frame, state = scheduler.frame(0), scheduler.state("indirect")
-        counts[visibility] = probes_in_sight(frame, state)
+        counts[visibility] = probes_in_sight(frame, state, visibility)
     points = frame.numpy("position") + 1e-4 * frame.numpy("normal")
     probes = state.field.positions.numpy()
     origins = np.repeat(points.reshape(-1, 3), 8, axis=0).astype(np.float32)
@@ -630,7 +630,7 @@ def test_the_picture_of_who_sees_what_counts_probes():
     assert known.mean() > 0.9 and counts["exact"].min() < 8  # the block hides some
     assert (counts["exact"] == clear.sum(axis=-1))[known].mean() > 0.95  # rays start a little apart on the sphere
     assert (np.abs(counts["probes"] - counts["exact"])[known] <= 1).mean() > 0.9
-    picture = draw_seen(frame, state)
+    picture = draw_seen(frame, state, "exact")
     assert picture.shape[0] > 24 and picture.shape[2] == 3 and len(np.unique(picture[:24, :32].reshape(-1, 3))) > 4
 
 
@@ -641,10 +641,10 @@ def test_only_points_left_to_paths_are_shown_as_such():
     camera = gi.Camera.look_at((0, -0.92, 0.97), (0, -0.93, 0), hfov=70, resolution=(32, 12))
     scheduler = gi.FrameScheduler(lamp_room(shelf), camera, indirect_only(**SMALL), seed=1)
     frame, state = scheduler.frame(0), scheduler.state("indirect")
-    counts = probes_in_sight(frame, state)
+    counts = probes_in_sight(frame, state, "probes")
     assert (counts == 0).any() and counts.max() > 1
     state.field.least_seen = 0.0  # the least that is seen is enough
-    assert (probes_in_sight(frame, state) > 0).all()
+    assert (probes_in_sight(frame, state, "probes") > 0).all()
 
 
 # ---- frames ----
@@ -723,7 +723,7 @@ def test_points_beyond_the_reach_of_moments_are_lit():
     ball = sphere((0, -0.4, 0), 0.3, gi.Material("ball", (0.8,) * 3, specular=0.0))
     scene = gi.Scene([gi.Node("all", [floor, ball])], environment=(1.0, 1.0, 1.0))
     settings = gi.LightFieldProbes(**SMALL)
-    state = ProbeState(scene, CPU, settings, 1, gi.bake(scene, settings))
+    state = ProbeState(scene, CPU, settings.probe_settings, 1, gi.bake(scene, settings))
     reach = 2 * np.linalg.norm(state.grid.spacing)
     moments = np.full((8, 16**2, 2), (reach, reach**2 * (1 + 1e-5)), np.float32)
     moments[0, :, 1] *= 1.01
@@ -775,7 +775,7 @@ def test_a_refreshed_map_keeps_part_of_what_it_knew():
     texels = state.field.radiance.shape[0]
 
     def refreshed(old, hysteresis):
-        state.settings = replace(settings, hysteresis=hysteresis)
+        state.settings = replace(state.settings, hysteresis=hysteresis)
         words = wp.zeros(texels, dtype=wp.uint32, device=CPU)
         words.fill_(old)
         state.field.radiance, state.refreshes = words, 0  # the same rays each time

@@ -37,7 +37,8 @@ from statistics_tools import chi_squared, device, every_device  # noqa: F401
 from warp_gi.alias import AliasTable
 from warp_gi.kernels import bsdf, light_cache, light_cache_native, ltc, types
 from warp_gi.launch import launch
-from warp_gi.techniques.light_hierarchy.tree import EmitterBounds, build_tree, to_device
+from warp_gi.techniques.light_hierarchy.bounds import EmitterBounds
+from warp_gi.techniques.light_hierarchy.tree import build_tree, to_device
 from warp_gi.techniques.reuse.light_cache import EXPLORES_BY
 from warp_gi.techniques.shared.ltc import ltc_table
 

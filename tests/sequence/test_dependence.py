@@ -8,6 +8,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import statistics_tools as st
+from scene_tools import quad
 
 import warp_gi as gi
 from warp_gi import launch
@@ -20,12 +21,6 @@ SIZE = (24, 16)
 FRAMES = 5
 FIELD = gi.VisibilityField(cell_size=0.5, resolution=16, samples=2000, rays=64)
 PROBES = gi.LightFieldProbes(counts=(2, 1, 2), resolution=16, irradiance_resolution=8, rays=1, bounces=2, update=2)
-
-
-def quad(corner, u, v, material):
-    corner, u, v = (np.asarray(x, np.float32) for x in (corner, u, v))
-    points = np.stack([corner, corner + u, corner + u + v, corner + v])
-    return gi.Mesh(points, np.array([[0, 1, 2], [0, 2, 3]], np.int32), material)
 
 
 def yard(moving):
@@ -290,7 +285,7 @@ def test_what_a_cell_gets_does_not_depend_on_the_pose_in_which_baking_began():
         scene.animate("plate", [gi.Keyframe(0.0, scale=(1.0, 1.0, 1.0)), gi.Keyframe(0.5, scale=(3.0, 3.0, 3.0))])
         scene.update(time, None, st.device())
         state = FIELD.start(scene, st.device().alias, None)
-        densities.append([state.baker(layer).density for layer in ("lasting", "at rest")])
+        densities.append([state.baker(layer).density for layer in ("static", "settled")])
     assert densities[0] == densities[1] and densities[0][0] == densities[0][1] > 0
 
 

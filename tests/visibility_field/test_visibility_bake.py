@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import warp as wp
+from scene_tools import quad
 from statistics_tools import device, every_device  # noqa: F401
 
 import warp_gi as gi
@@ -82,12 +83,6 @@ def trace_hinted(
     plain[i] = bvh_occluded(bvh, origins[i], directions[i], limits[i])
 
 
-def quad(corner, u, v, material=None):
-    corner, u, v = (np.asarray(x, np.float32) for x in (corner, u, v))
-    points = np.stack([corner, corner + u, corner + u + v, corner + v])
-    return gi.Mesh(points, np.array([[0, 1, 2], [0, 2, 3]], np.int32), material or gi.Material())
-
-
 def box(half):
     meshes = []
     for axis in range(3):
@@ -118,7 +113,7 @@ def soup(count=40, seed=3):
 
 
 def state_of(scene, seed=1, cells=None, **settings):
-    state = FieldState(scene, device(), gi.VisibilityField(**(SMALL | settings)), seed)
+    state = FieldState(scene, device(), gi.VisibilityField(**(SMALL | settings)).mask_settings, seed)
     state.bake(cells)
     return state
 
@@ -151,7 +146,7 @@ def centres(state, cells):
 
 def baker_of(scene, grid, seed=1, **settings):
     data = scene.data(device())
-    chosen = gi.VisibilityField(**(SMALL | settings))
+    chosen = gi.VisibilityField(**(SMALL | settings)).mask_settings
     return FieldBaker(data.geometry, data.bvh, scene.radius, grid, chosen, device(), seed)
 
 
@@ -521,7 +516,7 @@ def test_a_saved_bake_comes_back_bit_by_bit(tmp_path):
     loaded = gi.load_bake(made.save(tmp_path / "corner.bake"))
     assert set(made.arrays) == set(loaded.arrays) and made.settings == loaded.settings and made.counts == loaded.counts
     assert all(np.array_equal(made.arrays[name], loaded.arrays[name]) for name in made.arrays)
-    state, fresh = FieldState.from_bake(scene, device(), settings, 3, loaded), state_of(scene, seed=3)
+    state, fresh = FieldState.from_bake(scene, device(), settings.mask_settings, 3, loaded), state_of(scene, seed=3)
     for name in ("slots", "masks", "flags", "cells", "empty"):
         assert np.array_equal(getattr(state, name), getattr(fresh, name)), name
     assert state.counts == fresh.counts and state.counts["rays_traced"] > 0
@@ -573,7 +568,7 @@ def test_foreign_arrays_are_refused_in_one_line(change):
     made = gi.bake(scene, settings, str(device()))
     change(made.arrays)
     with pytest.raises(BakeError, match="bake it again") as caught:
-        FieldState.from_bake(scene, device(), settings, 0, made)
+        FieldState.from_bake(scene, device(), settings.mask_settings, 0, made)
     assert "\n" not in str(caught.value)
 
 

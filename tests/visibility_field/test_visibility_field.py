@@ -7,22 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import statistics_tools as st
+from scene_tools import quad, sphere
 from statistics_tools import every_device  # noqa: F401
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import sphere
 from warp_gi.errors import BakeError, OptionError
 from warp_gi.launch import set_threads
 from warp_gi.scene import harmonics
 
 SIZE = (32, 24)
 SMALL = {"cell_size": 0.25, "resolution": 24, "samples": 4000, "rays": 128}
-
-
-def quad(corner, u, v, material):
-    corner, u, v = (np.asarray(x, np.float32) for x in (corner, u, v))
-    points = np.stack([corner, corner + u, corner + u + v, corner + v])
-    return gi.Mesh(points, np.array([[0, 1, 2], [0, 2, 3]], np.int32), material)
 
 
 def courtyard(environment=(1.0, 0.8, 0.6), glossy=False, **settings):
@@ -262,15 +256,15 @@ def test_a_moving_object_is_never_wrong_and_is_baked_again_when_it_rests(mode):
     field = gi.VisibilityField(mode, **(SMALL | {"samples": 40_000}), **sky, budget=50.0)
     scheduler = gi.FrameScheduler(moving_scene(), path, pipeline(field), st._device)
     other = gi.FrameScheduler(moving_scene(), path, pipeline(gi.VisibilityField("traced", **sky)), st._device)
-    rest = []
+    settled = []
     for index in range(9):
         picture, truth = scheduler.frame(index).numpy("environment"), other.frame(index).numpy("environment")
-        rest.append(len(scheduler.state("environment").rest))
+        settled.append(len(scheduler.state("environment").settled.known))
         if mode != "unbiased":
             assert np.sqrt(np.mean((picture - truth) ** 2)) < 2e-3, index
         else:
             assert abs(picture.mean() / truth.mean() - 1) < 0.01
-    assert not any(rest[:5]) and rest[8] >= rest[6] > 0, rest
+    assert not any(settled[:5]) and settled[8] >= settled[6] > 0, settled
 
 
 def test_a_bake_is_used_saved_and_refused(tmp_path):
@@ -299,8 +293,8 @@ def test_a_field_grown_on_the_way_goes_on_bit_for_bit(tmp_path):
     """The state after two frames, saved and loaded, renders the third as an unbroken run does."""
     scene, field = courtyard(), gi.VisibilityField(**SMALL, budget=0.5)
     path = gi.CameraPath.still(view())
-    whole = gi.FrameScheduler(scene, path, pipeline(field), st._device)
-    whole._bakes = {"environment": gi.bake(scene, field, st._device, camera_path=replace(view(), hfov=8.0))}
+    bake = gi.bake(scene, field, st._device, camera_path=replace(view(), hfov=8.0))
+    whole = gi.FrameScheduler(scene, path, pipeline(field), st._device, bakes=[bake])
     images = [whole.frame(index).numpy("environment").copy() for index in range(2)]
     saved = gi.load_bake(whole.state("environment").to_bake().save(tmp_path / "two"))
     images.append(whole.frame(2).numpy("environment").copy())

@@ -3,34 +3,41 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, Generic, NamedTuple, TypeVar
 
 from warp_gi.baking import Bake
 from warp_gi.estimator import Estimator
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.scene import Scene
 
-Rows = list[tuple[str, Any]]
+Value = str | int | float
+Rows = list[tuple[str, Value]]
+"""Rows of a table of two columns: what a value is, with its unit, and the value."""
+
+Settings = TypeVar("Settings", bound=Estimator)
 
 
 class Table(NamedTuple):
-    """A table to print: its title, names of columns, and rows."""
+    """A table to print."""
 
     title: str
+    """Heading of the table."""
     columns: tuple[str, ...]
-    rows: list[tuple[Any, ...]]
+    """Names of the columns."""
+    rows: Sequence[tuple[Value, ...]]
+    """Rows, each with a value for every column."""
 
 
-class BakeTool(ABC):
+class BakeTool(ABC, Generic[Settings]):
     """How one technique is baked from the command line.
 
     A technique's module ``bake_tool`` has an instance of its own subclass as ``TOOL``; the registry names that module.
     """
 
-    settings: ClassVar[type[Estimator]]
-    """The estimator whose bake it is; its fields are the flags."""
+    settings: type[Settings]
+    """Class of the estimator that is baked; its fields are the flags."""
     summary: ClassVar[Sequence[str]]
     """Lines of the command's help that say what is baked."""
     shows: ClassVar[Sequence[str]]
@@ -40,18 +47,18 @@ class BakeTool(ABC):
     examples: ClassVar[Sequence[str]]
     """Arguments of the command's examples, as "hall.glb --cell-size 0.5"; without ``--technique``."""
     exported: ClassVar[str]
-    """What the files of an export are called, as "textures"."""
+    """Word for the files of an export, as "textures"."""
     needs_sky: ClassVar[bool] = False
-    """Whether its pictures show nothing without a sky, so that a white one stands for it."""
+    """Whether its pictures show nothing without a sky, so that a white sky stands in for one."""
     finds_places: ClassVar[bool] = False
-    """Whether it finds out by itself what to bake of a scene that has no camera."""
+    """Whether the bake chooses what to bake in a scene that has no camera."""
 
     @abstractmethod
-    def check(self, settings: Any, everywhere: bool) -> None:
-        """Raise OptionError for settings that cannot be baked, or if all of a scene was asked for in vain."""
+    def check(self, settings: Settings, everywhere: bool) -> None:
+        """Raise OptionError for settings that cannot be baked, or if ``everywhere`` means nothing for them."""
 
     @abstractmethod
-    def check_scene(self, settings: Any, scene: Scene) -> None:
+    def check_scene(self, settings: Settings, scene: Scene) -> None:
         """Raise OptionError for a bake of the scene that would be too large."""
 
     @abstractmethod
@@ -64,23 +71,23 @@ class BakeTool(ABC):
 
     @abstractmethod
     def write_pictures(
-        self, scene: Scene, camera: Camera, bake: Bake, settings: Any, folder: Path, device: str, seed: int
+        self, scene: Scene, camera: Camera, bake: Bake, settings: Settings, folder: Path, device: str, seed: int
     ) -> list[Path]:
         """Write pictures of the bake to a folder and return their paths."""
 
     @abstractmethod
     def rows(self, bake: Bake, seconds: float) -> Rows:
-        """Return rows of the closing table, of a bake and the seconds that it took."""
+        """Return rows of the closing table about a bake that took so many seconds."""
 
     def tables(self, bake: Bake) -> list[Table]:
-        """Return what else there is to tell, after the closing table."""
+        """Return tables to print after the closing one."""
         return []
 
-    def advice(self, bake: Bake, settings: Any) -> str:
+    def advice(self, bake: Bake, settings: Settings) -> str:
         """Return one line on what to do for a better bake; "" if there is nothing to say."""
         return ""
 
 
-def times(values: Any) -> str:
+def times(values: Iterable[object]) -> str:
     """Return numbers as "4 x 4 x 4"."""
     return " x ".join(map(str, values))

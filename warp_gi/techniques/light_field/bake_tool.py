@@ -16,13 +16,13 @@ from warp_gi.techniques.light_field.places import probe_grid
 from warp_gi.techniques.light_field.state import baked_resolution, bounce_changes
 
 
-class LightFieldTool(BakeTool):
-    """Bakes the whole grid of probes, placed by the camera path or by where light is."""
+class LightFieldTool(BakeTool[LightFieldProbes]):
+    """Bakes all probes of a grid, which lies around what the camera path reaches, or else where light is."""
 
     settings = LightFieldProbes
     summary = (
-        "The light all around each point of a grid, under the scene's sky, over the space that",
-        "paths from the camera reach, wherever it goes.",
+        "The light that arrives at each point of a grid from all directions, under the scene's sky. The grid",
+        "fills the space that light paths from the camera reach, along the whole of its path.",
     )
     shows = ("their maps, their places in the view, and the path of a ray through the maps",)
     exports = ("atlases NAME.radiance.exr and so on for NAME.exr",)
@@ -34,7 +34,7 @@ class LightFieldTool(BakeTool):
     finds_places = True
 
     def check(self, settings: LightFieldProbes, everywhere: bool) -> None:
-        """Raise OptionError for a way to render, or for all of a scene."""
+        """Raise OptionError for settings that are a way to render, and for ``everywhere``."""
         if everywhere:
             raise OptionError(
                 "--everywhere goes with visibility fields; a bake of probes is always of the whole grid: omit it"
@@ -45,9 +45,9 @@ class LightFieldTool(BakeTool):
             )
 
     def check_scene(self, settings: LightFieldProbes, scene: Scene) -> None:
-        """Raise OptionError for too many probes, where their counts are given; else the bake finds out."""
+        """Raise OptionError for too many probes, if their counts are given; without, only the bake knows them."""
         if all(settings.counts):
-            probe_grid(scene.bounds, settings.counts, settings.spacing, settings.largest_map)
+            probe_grid(scene.bounds, settings.counts, settings.spacing, settings.probe_settings.largest_map)
 
     def check_export_name(self, path: Path) -> None:
         """Raise OptionError unless the file is an .exr."""
@@ -64,7 +64,7 @@ class LightFieldTool(BakeTool):
         return pictures.write_pictures(scene, camera, bake, settings, folder, device, seed)
 
     def rows(self, bake: Bake, seconds: float) -> Rows:
-        """Return counts of probes, texels and rays, how fast they were, and what bounces changed."""
+        """Return counts of probes, texels and rays, rays a second, and what the last bounce changed."""
         counts, settings, changes = bake.counts, bake.settings, bounce_changes(bake)
         size, few = baked_resolution(bake), int(settings["irradiance_resolution"])
         return [
@@ -90,7 +90,7 @@ class LightFieldTool(BakeTool):
         return [Table("light that bounces", ("bounce", "change of the irradiance"), rows)]
 
     def advice(self, bake: Bake, settings: LightFieldProbes) -> str:
-        """Return that light needs more bounces, if it does."""
+        """Return advice to allow more bounces, if light still changed too much in the last one."""
         last = bounce_changes(bake)[-1]
         if not settings.tolerance or last <= settings.tolerance:
             return ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
@@ -14,18 +14,19 @@ from warp_gi import launch
 from warp_gi.baking import Bake
 from warp_gi.errors import BakeError, OptionError, check_whole, unknown_name
 from warp_gi.estimator import Ahead, Estimator
+from warp_gi.kernels import gbuffer, light_field_cache
 from warp_gi.kernels import light_field as field_kernels
-from warp_gi.kernels import light_field_cache
 from warp_gi.kernels import light_field_trace as trace_kernels
 from warp_gi.primary import Primary
 from warp_gi.radiance_cache import RadianceCache
+from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.camera import Camera, CameraPath
-from warp_gi.techniques.light_field.places import MOST_PROBES, camera_rows, cameras_of, lit_data, map_resolution
+from warp_gi.techniques.light_field.places import camera_rows, cameras_of, lit_data
+from warp_gi.techniques.light_field.settings import ProbeSettings
 from warp_gi.techniques.light_field.state import ProbeState, path_settings, sky_bytes
 
 if TYPE_CHECKING:
     from warp_gi.frame import Frame
-    from warp_gi.scene.baked import BakedScene
     from warp_gi.scene.scene import Scene
 
 _MODES = {
@@ -38,62 +39,68 @@ VISIBILITIES = {"probes": light_field_cache.VISIBILITY_PROBES, "exact": light_fi
 _PRIMARIES = ("geometry", "probes")
 _WEIGHTS = ("visibility", "trilinear")
 MOST_RESOLUTION = 1024
+"""Largest number of texels along a side of a map."""
 UNSEEN_RAYS = 16
-"""Least rays of a pixel whose surface too few probes see; these are few pixels, and beside the others look noisy."""
+"""Least number of rays of a pixel whose surface too few probes see. Such pixels are few, and would look noisy beside
+the others."""
 SAME_VIEW = 1e-4
-"""Share of its size by which a number of a camera may differ from that of one that a bake was made for."""
+"""Largest relative difference between a number of a camera and that of a bake's camera for the two to be the same."""
 SETTLED = 0.02
-"""Share of an old state that may be left in the irradiance when a probe counts as refreshed."""
+"""Share of the irradiance before a change that may be left in a probe's when it counts as refreshed."""
 
 
 @dataclass(frozen=True)
 class LightFieldProbes(Estimator, RadianceCache):
-    """Indirect light from a grid of probes that hold radiance, normals and distances all around.
+    """Indirect light from a grid of probes that hold radiance, normals and distances in all directions.
 
-    Biased: by how many probes there are, how finely they look, and by what a probe cannot see. (McGuire et al. 2017,
-    "Real-Time Global Illumination using Precomputed Light Field Probes".)
+    Biased: the error depends on the number of probes, on their resolution, and on what they cannot see. (McGuire
+    et al. 2017, "Real-Time Global Illumination using Precomputed Light Field Probes".)
     """
 
     term: ClassVar[str] = "indirect"
 
     mode: Literal["irradiance", "hybrid", "traced"] = "hybrid"
-    """"irradiance" reads filtered irradiance and has no noise; "hybrid" does so for the diffuse part and traces rays
-    for the glossy one; "traced" traces rays for all."""
+    """Which light is traced: "irradiance" traces none, reads the probes' filtered irradiance and has no noise; "hybrid"
+    does so for the diffuse part and traces rays for the glossy part; "traced" traces rays for both."""
     through: Literal["geometry", "probes"] = "geometry"
-    """What rays are traced through. "geometry": the scene; what they meet is lit by its direct light, sampled, and by
-    the probes' irradiance. "probes": their maps alone, as in the paper, which takes many times as long on a CPU."""
+    """What rays are traced through. "geometry" is the scene: what rays meet is lit by direct light, which is sampled,
+    and by the probes' irradiance. "probes" is their maps alone, as in the paper, which takes many times as long on a
+    CPU."""
     visibility: Literal["probes", "exact"] = "probes"
-    """Who tells which of the eight probes around a point see it: their maps, or "exact" shadow rays, for less light
-    behind walls at two or three times the price. Where too few see it rays are traced."""
+    """How the probes that see a point are found among the eight around it: by their maps ("probes"), or by shadow rays
+    ("exact"), which let less light through walls and take two to three times as long. Where too few probes see a
+    point, rays are traced."""
     counts: tuple[int, int, int] = (0, 0, 0)
     """Probes along x, y and z of the box that paths from the camera reach; 0 follows from the spacing."""
     spacing: float = 0.0
-    """Metres between probes; 0 is a twelfth of the longest side, or as much more as it takes for at most 440 probes, in
-    rooms 100, and 128 if no camera is known."""
+    """Metres between probes; 0 is a twelfth of the box's longest side, or as much more as keeps the number of probes to
+    440, in rooms to 100, and to 128 if no camera is known."""
     resolution: int = 0
     """Texels along a side of a probe's map, a multiple of 16; 0 is 128 for up to 128 probes, 64 for more."""
     irradiance_resolution: int = 32
-    """Texels along a side of its map of irradiance; the paper has 32 to 128."""
+    """Texels along a side of a probe's map of irradiance; the paper has 32 to 128."""
     rays: int = 2
     """Rays a texel while baking."""
     bounces: int = 16
-    """Most passes of light from probes to probes; the first is light that was reflected once."""
+    """Largest number of passes of light from probes to probes; the first pass is light that was reflected once."""
     tolerance: float = 0.002
     """Relative change of the irradiance below which light bounces no more."""
     relocate: bool = True
-    """Move probes out of walls, or away from them, by up to half the distance to the next."""
+    """Move probes out of walls, or away from them, by up to half the distance to the next probe."""
     weights: Literal["visibility", "trilinear"] = "visibility"
-    """"trilinear" blends the eight probes around a point as if all of them saw it, to compare with."""
+    """How the eight probes around a point are blended: "visibility" weighs those that see it; "trilinear" takes all as
+    if they did, to compare with."""
     pixel_rays: int = 0
-    """Rays a pixel in the modes "hybrid" and "traced", at least one a camera sample; 0 is one for each of the
+    """Rays a pixel in the modes "hybrid" and "traced", at least one for each camera sample; 0 is one for each of the
     pipeline's samples."""
     update: int = 8
-    """Probes that are refreshed each frame, when the sky turned or something moved."""
+    """Probes that are refreshed in each frame after the sky changed or something moved."""
     hysteresis: float = 0.5
     """Share of its old irradiance that a refreshed probe keeps."""
     primary: Literal["geometry", "probes"] = "geometry"
-    """"probes" traces the camera's rays through the probes too, which hold all light, not only indirect: no geometry
-    is needed, a bake is enough. Needs a pipeline without other terms, as the preset "probe_view"."""
+    """What the camera's rays are traced through: the scene ("geometry"), or the probes' maps ("probes"), which hold all
+    light, not only indirect: then a bake is enough and no geometry is needed. "probes" needs a pipeline without other
+    terms, as the preset "probe_view"."""
 
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
@@ -131,20 +138,23 @@ class LightFieldProbes(Estimator, RadianceCache):
         if not 0 <= self.hysteresis < 1:
             raise OptionError(f"hysteresis must be a share of at least 0 and below 1, got {self.hysteresis}")
 
+    @property
+    def probe_settings(self) -> ProbeSettings:
+        """The settings that decide where probes stand and what they hold."""
+        return ProbeSettings(**{field.name: getattr(self, field.name) for field in fields(ProbeSettings)})
+
     # ---- bake ----
 
     def bake_key(self, scene: Scene | BakedScene) -> str:
         """Return the hash of geometry, materials and lights. A changed sky needs no new bake: probes adapt to it.
 
-        They do so in some frames if it changes while frames are rendered, before the first one else.
+        They adapt before the first frame, or, if the sky changes from frame to frame, over some frames.
         """
         return scene.contents_hash
 
     def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Any]:
         """Return the settings that decide the maps."""
-        names = ("spacing", "resolution", "irradiance_resolution", "rays", "bounces", "tolerance", "relocate")
-        counts = "x".join(str(int(n)) for n in self.counts)
-        return {"counts": counts, "weights": self.weights, **{name: getattr(self, name) for name in names}}
+        return self.probe_settings.stored()
 
     def bake(
         self,
@@ -156,26 +166,30 @@ class LightFieldProbes(Estimator, RadianceCache):
     ) -> Bake:
         """Return the probes' maps, for the scene's sky and its pose at time 0.
 
-        The grid is that of ``light_field_places.place_grid``: around what ``camera`` reaches over its whole path, or
-        the scene's own cameras. What it will take is logged before it starts (logger "warp_gi", level INFO).
+        The grid lies over what ``camera`` reaches on its whole path, or the scene's own cameras. The memory and time
+        that the bake will take are logged before it starts (logger "warp_gi", level INFO).
         """
-        state = ProbeState(scene, launch.get_device(device), self, seed, camera=camera)
+        state = ProbeState(scene, launch.get_device(device), self.probe_settings, seed, camera=camera)
         state.bake(scene, progress)
         return state.to_bake(scene)
 
     def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> ProbeState:
-        """Return the state of probes that hold a bake; under another sky than its own they are filled again."""
-        target = launch.get_device(device)
-        state = ProbeState(scene, target, self, seed, bake)
+        """Return the state of probes that hold a bake, one made now if it is None.
+
+        Under another sky than the bake's the probes are filled again.
+        """
+        if bake is None:
+            bake = self.bake(whole_scene(scene), device, seed)
+        state = ProbeState(scene, launch.get_device(device), self.probe_settings, seed, bake)
         if scene.triangle_count and not np.array_equal(bake.arrays["sky"], sky_bytes(scene)):
-            state.fill(scene, lit_data(scene, state.device))
+            state.fill(whole_scene(scene), lit_data(scene, state.device))
         state.key = _key(scene, 0.0)
         return state
 
     def check_view(self, bake: Bake, camera: Camera | CameraPath) -> None:
         """Warn if a bake was made for another camera path: where its probes see nothing, rays are traced.
 
-        Raises BakeError for one by a version that did not place probes by cameras.
+        Raises BakeError for a bake by a version that did not place probes by cameras.
         """
         if "cameras" not in bake.arrays:
             raise BakeError(
@@ -206,17 +220,12 @@ class LightFieldProbes(Estimator, RadianceCache):
     # ---- frames ----
 
     @property
-    def largest_map(self) -> int:
-        """Texels along a side of the largest map of a probe, if there are many of them."""
-        return max(map_resolution(self.resolution, MOST_PROBES), self.irradiance_resolution)
-
-    @property
     def own_primary(self) -> Primary | None:
-        """Camera rays through the probes, if they are to be traced there."""
+        """Camera rays through the probes, if ``primary`` is "probes"; else None."""
         return ProbeRays() if self.primary == "probes" else None
 
     def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
-        """Return whether the sky changes, as probes begin with that of the first frame, or they follow what moves."""
+        """Return whether frames may show probes that follow a sky or objects, and so what earlier frames refreshed."""
         return ahead is None or ahead.sky_changes or (self.update > 0 and scene.is_animated)
 
     def preprocess(self, frame: Frame, state: ProbeState) -> ProbeState:
@@ -229,12 +238,13 @@ class LightFieldProbes(Estimator, RadianceCache):
         if self.update and state.pending.any():
             state = state.copied(with_maps=True)
             probes = state.take_stale(self.update)
-            state.refresh(frame.scene, lit_data(frame.scene, state.device), probes)
+            scene = whole_scene(frame.scene)
+            state.refresh(scene, lit_data(scene, state.device), probes)
         return state
 
     @property
     def refreshes_to_settle(self) -> int:
-        """Refreshes of a probe until what it saw before no longer counts, and light has bounced a few times."""
+        """Number of refreshes of a probe until less than ``SETTLED`` of its old light is left, at least 4."""
         fading = math.ceil(math.log(SETTLED) / math.log(self.hysteresis)) if self.hysteresis > 0 else 1
         return max(fading, 4)
 
@@ -281,14 +291,16 @@ class ProbeRays(Primary):
         frame.launch_tiled(trace_kernels.view_probes, inputs)
 
 
-def _evenly(rays: int, settings: Any) -> tuple[int, int, int]:
-    """Return how many rays a camera sample has, its first, and the bits of their number: so many shared out evenly."""
+def _evenly(rays: int, settings: gbuffer.PassSettings) -> tuple[int, int, int]:
+    """Return a camera sample's share of a pixel's rays: their number, the first one, and the bits of all numbers."""
     each = -(-rays // settings.camera_samples)
     return each, settings.camera_sample * each, (each * settings.camera_samples - 1).bit_length()
 
 
 def _key(scene: Scene | BakedScene, time: float) -> str:
     """Return what the light in the probes depends on beside geometry, materials and lights: the sky, and poses."""
+    if isinstance(scene, BakedScene):
+        return ""
     sky = "" if scene.environment is None else scene.environment.content_hash
     poses = [scene.world_from_node(index, time).tobytes() for index in range(len(scene.nodes)) if scene.moves(index)]
     return sky + b"".join(poses).hex()

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ ATLASES = {
     "irradiance": ("irradiance_resolution", "float", "RGB", "W/m^2", "linear"),
     "moments": ("irradiance_resolution", "float", "RGB", "m, m^2, 0", "linear"),
 }
-"""Name of each atlas: the setting that tells its maps' resolution, type, channels, units, and how it is filtered."""
+"""Atlases by name: the setting that is their maps' resolution, type, channels, units, and how they are filtered."""
 
 TEXT = {
     "probes": "Probe (x, y, z) of the grid has index i = (z * counts.y + y) * counts.x + x. Of the regular grid it "
@@ -91,7 +92,9 @@ def unpack_normal(surfels: np.ndarray) -> np.ndarray:
 
 
 def probe_maps(bake: Bake) -> dict[str, Callable[[int], np.ndarray]]:
-    """Return for each of ``ATLASES`` what makes the map of a probe by its index, float16 or float32 [texel, channel].
+    """Return for each of ``ATLASES`` a function of a probe's index.
+
+    It returns the probe's map, float16 or float32 [texel, channel].
 
     Raises BakeError for bakes of other techniques.
     """
@@ -121,8 +124,11 @@ def probe_maps(bake: Bake) -> dict[str, Callable[[int], np.ndarray]]:
     }
 
 
-def atlas_columns(counts: tuple[int, int, int]) -> int:
-    """Return tiles along x of an atlas: whole rows of the grid, as many as make it about square."""
+def atlas_columns(counts: Sequence[int]) -> int:
+    """Return the number of tiles side by side in an atlas: whole rows of the grid that make it about square.
+
+    ``counts`` are the probes along x, y and z.
+    """
     return counts[0] * max(round(math.sqrt(math.prod(counts)) / counts[0]), 1)
 
 
@@ -138,10 +144,10 @@ def check_export_name(path: str | Path) -> None:
 def export_atlases(bake: Bake, path: str | Path) -> list[Path]:
     """Write probes as atlases NAME.radiance.exr, .normal, .distance, .irradiance and .moments, and NAME.json.
 
-    ``path`` is NAME.exr. A file for each atlas, for engines read one picture of up to four channels from an EXR file.
-    The JSON file is complete; it is the last of the paths returned, and appears after the others. Files of an earlier
-    export stay until all new ones are whole. Raises OptionError for other names, OSError when nothing can be written,
-    BakeError for bakes of other techniques.
+    ``path`` is NAME.exr. Each atlas has a file of its own, as engines read one picture of up to four channels from an
+    EXR file. The JSON file says all that is needed to read them; it is the last of the paths returned, and appears
+    after the others. Files of an earlier export stay until all new ones are whole. Raises OptionError for other names,
+    OSError when nothing can be written, BakeError for bakes of other techniques.
     """
     path = Path(path)
     check_export_name(path)
@@ -158,10 +164,15 @@ def export_atlases(bake: Bake, path: str | Path) -> list[Path]:
         parts = {name: stack.enter_context(replacing(file)) for name, file in files.items()}
         for name, part in parts.items():
             pixels = _atlas(makers[name], math.prod(counts), columns, rows)
-            write_parts(part, files[name], lambda _, pixels=pixels: pixels, ATLASES[name][2])
+            write_parts(part, files[name], partial(_whole, pixels), ATLASES[name][2])
         text.write_text(_description(bake, columns, rows, files))
         description.unlink(missing_ok=True)  # while atlases of two exports may stand beside each other
     return [*files.values(), description]
+
+
+def _whole(pixels: np.ndarray, part: int) -> np.ndarray:
+    """Return the pixels of a file's only part."""
+    return pixels
 
 
 def _atlas(maker: Callable[[int], np.ndarray], count: int, columns: int, rows: int) -> np.ndarray:
@@ -177,9 +188,13 @@ def _atlas(maker: Callable[[int], np.ndarray], count: int, columns: int, rows: i
 
 
 def _description(bake: Bake, columns: int, rows: int, files: dict[str, Path]) -> str:
+    """Return the text of an export's JSON file."""
     arrays = bake.arrays
     sizes = {"resolution": baked_resolution(bake), "irradiance_resolution": int(bake.settings["irradiance_resolution"])}
-    per_axis = lambda values: dict(zip("xyz", (v.item() for v in values), strict=True))  # noqa: E731
+
+    def per_axis(values: np.ndarray) -> dict[str, float]:
+        return dict(zip("xyz", (v.item() for v in values), strict=True))
+
     info = {
         "format": FORMAT,
         "scene": bake.scene_name,
@@ -227,7 +242,7 @@ def read_atlases(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any
     for name, atlas in info["atlases"].items():
         source = oiio.ImageInput.open(str(Path(path).parent / atlas["file"]))
         pixels = source.read_image(atlas["type"]) if source else None
-        if pixels is None or source.has_error:
+        if source is None or pixels is None or source.has_error:
             (source or oiio).geterror()  # taken, so that it is not printed when the program ends
             raise OSError(f"{atlas['file']}: expected a whole EXR file beside {Path(path).name}; export again")
         images[name] = pixels.reshape(*pixels.shape[:2], -1)
@@ -237,14 +252,14 @@ def read_atlases(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any
 def look_up(
     images: dict[str, np.ndarray], info: dict[str, Any], name: str, probes: np.ndarray, directions: np.ndarray
 ) -> np.ndarray:
-    """Return what probes say about directions, float32 [n, channel], of what ``read_atlases`` returned.
+    """Return what probes hold in directions, float32 [item, channel].
 
     Args:
-        images: The atlases.
-        info: Their description.
-        name: Of an atlas.
-        probes: int [n].
-        directions: float [n, 3], of any length above zero.
+        images: Atlases, as ``read_atlases`` returns them.
+        info: Description of the atlases.
+        name: Name of an atlas.
+        probes: int [item], index of the probe that is asked.
+        directions: float [item, 3], of any length above zero.
     """
     image, atlas, padding = images[name], info["atlases"][name], info["padding"]
     size, tile = atlas["size"], atlas["size"] + 2 * padding

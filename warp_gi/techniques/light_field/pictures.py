@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import warp as wp
 
 from warp_gi.baking import Bake
+from warp_gi.denoise import SpatioTemporal
 from warp_gi.frame import Frame
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_march as march_kernels
@@ -20,24 +21,29 @@ from warp_gi.scene.camera import Camera
 from warp_gi.scene.scene import Scene
 from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence.preview import magma, tone_map, write_pngs
-from warp_gi.techniques.light_field.estimator import VISIBILITIES
+from warp_gi.techniques.light_field.estimator import VISIBILITIES, LightFieldProbes
 from warp_gi.techniques.light_field.export import probe_maps
 from warp_gi.techniques.light_field.ray import draw_ray, march_rays, probe_color, ray_looks
+from warp_gi.techniques.light_field.state import ProbeState
 from warp_gi.techniques.shared.legends import exposure_of, label_font, scale_bar, stacked, with_keys
 
+if TYPE_CHECKING:
+    from PIL.ImageDraw import ImageDraw as Drawing
+
 SHOW_SAMPLES = 16
+"""Samples a pixel of the view that probes are drawn in."""
 SHEET_PIXELS = 1600
-"""Across a picture of all maps, about."""
+"""Width in pixels of a picture of all maps, about."""
 SHEET_ASPECT = 1.5
-"""Width of such a picture over its height, about."""
+"""Width of a picture of all maps over its height, about."""
 MOST_TILES, MOST_COLUMNS = 2500, 200
-"""Maps in such a picture, and across it."""
+"""Largest number of maps in a picture of all maps, and of maps side by side."""
 MOST_NUMBERS = 150
-"""Probes in view up to which each has its number."""
-UNSEEN_COLOR = (0, 158, 115)  # of Okabe and Ito's palette, too
-SKY_COLOR = (86, 180, 233)  # of Okabe and Ito's palette
+"""Largest number of probes in view for which each is labelled with its number."""
+UNSEEN_COLOR = (0, 158, 115)  # from the palette of Okabe and Ito, as the next
+SKY_COLOR = (86, 180, 233)
 CANDIDATES = 8
-"""Rays that are followed look by look to find one whose path shows much."""
+"""Number of rays that are followed look by look, to choose one whose path shows much."""
 _SMOOTH = 2  # pixels of a drawing in one of the picture
 
 
@@ -45,7 +51,7 @@ def write_pictures(
     scene: Scene,
     camera: Camera,
     bake: Bake,
-    settings: Any,
+    settings: LightFieldProbes,
     folder: str | Path,
     device: str = "cpu",
     seed: int = 0,
@@ -53,28 +59,28 @@ def write_pictures(
     """Write what probes hold, where they stand and how a ray finds its way through them; return the paths.
 
     radiance.png, distance.png, normal.png, irradiance.png: the maps of all probes, with the colour and number of each.
-    places.png: the probes in a view of the scene (light_field_probes.txt, Fig. 1). seen.png: how many of the probes
-    around it see each point of the view. ray.png: the path of a ray that a
-    pixel of the view reflects, one that asks several probes if there is one (Fig. 4).
+    places.png: the probes in a view of the scene (light_field_probes.txt, Fig. 1). seen.png: for each point of the
+    view, how many of the eight probes around it see it. ray.png: the path of a ray that a pixel of the view reflects,
+    one that asks several probes if there is one (Fig. 4).
 
     Args:
-        scene: What was baked.
-        camera: The view.
-        bake: Of the scene.
-        settings: The LightFieldProbes of the bake.
+        scene: Scene that was baked.
+        camera: View that is shown.
+        bake: Bake of the scene.
+        settings: Settings of the bake.
         folder: Where pictures go; made if missing.
         device: Where to render.
-        seed: Of the view.
+        seed: Seed of the view.
     """
     shown = replace(settings, mode="irradiance", primary="geometry", update=0)
-    pipeline = Pipeline(indirect=shown, spp=SHOW_SAMPLES, denoise="spatiotemporal")
+    pipeline = Pipeline(indirect=shown, spp=SHOW_SAMPLES, denoise=SpatioTemporal())
     scheduler = FrameScheduler(scene, camera, pipeline, device, seed, bakes=[bake])
     frame = scheduler.frame(0)
     state = scheduler.state("indirect")
     exposure = exposure_of(bake.arrays["irradiance"].astype(np.float64) / math.pi)
     origin, direction = _telling_ray(frame, state)
     pictures = _sheets(bake, exposure)
-    pictures |= {"places": draw_places(frame, state), "seen": draw_seen(frame, state)}
+    pictures |= {"places": draw_places(frame, state), "seen": draw_seen(frame, state, settings.visibility)}
     pictures["ray"] = draw_ray(state, origin, direction, exposure)
     return write_pngs(folder, pictures)
 
@@ -83,13 +89,17 @@ def write_pictures(
 
 
 def _sheets(bake: Bake, exposure: float) -> dict[str, np.ndarray]:
+    """Return a picture of all maps of each kind, by name, uint8 [height, width, 3]."""
     makers, counts = probe_maps(bake), tuple(int(n) for n in bake.arrays["grid_counts"])
     count, total = min(math.prod(counts), MOST_TILES), math.prod(counts)
     columns = min(_sheet_columns(counts[0], count), MOST_COLUMNS)
     covered = bake.arrays["states"] != int(field_kernels.PROBE_USABLE)
 
     def tiles(name: str) -> np.ndarray:
-        """Return the maps of one kind, float32, as small as the picture takes: means, or texels in the middle."""
+        """Return the maps of one kind, float32 [probe, size, size, channel], as small as the picture takes.
+
+        Each texel is the mean of those that it stands for; of distances and normals, the one in the middle.
+        """
         size = math.isqrt(len(makers[name](0)))
         step = next(f for f in range(1, size + 1) if size % f == 0 and columns * size / f <= SHEET_PIXELS)
         maps = []
@@ -121,7 +131,7 @@ def _sheets(bake: Bake, exposure: float) -> dict[str, np.ndarray]:
 
 
 def _sheet_columns(along_x: int, count: int) -> int:
-    """Return tiles along x: whole rows of the grid, for a sheet of about the wanted shape with little left blank."""
+    """Return the number of tiles side by side: whole rows of the grid, in a sheet of about the wanted shape."""
 
     def cost(columns: int) -> float:
         rows = math.ceil(count / columns)
@@ -156,7 +166,7 @@ def _sheet(maps: np.ndarray, columns: int, covered: np.ndarray) -> np.ndarray:
     return np.asarray(image)
 
 
-def _cross(draw: Any, box: tuple[float, float, float, float], width: int) -> None:
+def _cross(draw: Drawing, box: tuple[float, float, float, float], width: int) -> None:
     for color, wide in (((0, 0, 0), 3 * width), ((255, 255, 255), width)):
         draw.line(box, fill=color, width=wide)
         draw.line((box[0], box[3], box[2], box[1]), fill=color, width=wide)
@@ -165,8 +175,8 @@ def _cross(draw: Any, box: tuple[float, float, float, float], width: int) -> Non
 # ---- places ----
 
 
-def draw_places(frame: Frame, state: Any) -> np.ndarray:
-    """Return a rendered frame with a disc for each probe of a ProbeState, uint8 [height + legend, width, 3].
+def draw_places(frame: Frame, state: ProbeState) -> np.ndarray:
+    """Return a rendered frame with a disc for each probe, uint8 [height + legend, width, 3].
 
     Probes in view are filled, those behind a surface are rings; covered ones are crossed out.
     """
@@ -196,8 +206,8 @@ def draw_places(frame: Frame, state: Any) -> np.ndarray:
         else:
             draw.ellipse(box, fill=(*color, 255), outline=(0, 0, 0, 255), width=_SMOOTH)
             if inside.sum() <= MOST_NUMBERS:
-                stroke = {"stroke_width": _SMOOTH, "stroke_fill": (0, 0, 0, 255)}
-                draw.text((x, y - r), str(probe), fill=(255, 255, 255, 255), font=font, anchor="md", **stroke)
+                black, white = (0, 0, 0, 255), (255, 255, 255, 255)
+                draw.text((x, y - r), str(probe), white, font, "md", stroke_width=_SMOOTH, stroke_fill=black)
         if covered[probe]:
             _cross(draw, (x - 1.4 * r, y - 1.4 * r, x + 1.4 * r, y + 1.4 * r), _SMOOTH)
     image = Image.fromarray(tone_map(beauty, exposure_of(beauty))).convert("RGBA")
@@ -212,28 +222,30 @@ def draw_places(frame: Frame, state: Any) -> np.ndarray:
 # ---- who sees what ----
 
 
-def probes_in_sight(frame: Frame, state: Any) -> np.ndarray:
-    """Return how many of the eight probes around it see what a pixel of the last camera sample shows.
+def probes_in_sight(frame: Frame, state: ProbeState, visibility: Literal["probes", "exact"]) -> np.ndarray:
+    """Return how many of the eight probes around each pixel's surface see it, int32 [height, width].
 
-    int32 [height, width]: 0 where too few do and rays are traced, -1 where there is no surface.
+    The surface is that of the last camera sample. 0 means that too few probes see it, and rays are traced; -1 that
+    there is none. ``visibility`` is that of LightFieldProbes: how it is found out.
     """
     width, height = frame.camera.resolution
     counts = wp.empty(width * height, dtype=wp.int32, device=frame.device)
-    visibility = VISIBILITIES[state.settings.visibility]
-    frame.launch(trace_kernels.count_probes, [frame.data, state.field, visibility, frame.hits, counts])
+    inputs = [frame.data, state.field, VISIBILITIES[visibility], frame.hits, counts]
+    frame.launch(trace_kernels.count_probes, inputs)
     return counts.numpy().reshape(height, width)
 
 
-def draw_seen(frame: Frame, state: Any) -> np.ndarray:
+def draw_seen(frame: Frame, state: ProbeState, visibility: Literal["probes", "exact"]) -> np.ndarray:
     """Return ``probes_in_sight`` in colours, shaded as the frame is, uint8 [height + legend, width, 3]."""
-    counts = probes_in_sight(frame, state)
+    counts = probes_in_sight(frame, state, visibility)
     colors = np.concatenate([[UNSEEN_COLOR], magma(np.arange(1, 9)[None] / 9)[0]]).astype(np.uint8)
     shade = tone_map(frame.numpy("beauty"), exposure_of(frame.numpy("beauty"))).mean(axis=-1, keepdims=True) / 255
     image = colors[np.maximum(counts, 0)] * (0.55 + 0.45 * shade)
     image[counts < 0] = 255
     surface = counts >= 0
     unseen = float((counts == 0).sum() / max(surface.sum(), 1))
-    keys = [(tuple(map(int, colors[n])), str(n) if n else "too few: rays are traced") for n in range(9)]
+    shades = [(int(r), int(g), int(b)) for r, g, b in colors]
+    keys = [(shade, str(n) if n else "too few: rays are traced") for n, shade in enumerate(shades)]
     title = f"probes, of the eight around it, that see a point; {unseen:.1%} of the surface in view is left to rays"
     return with_keys(image.astype(np.uint8), tuple(keys), title)
 
@@ -242,9 +254,9 @@ def draw_seen(frame: Frame, state: Any) -> np.ndarray:
 
 
 def _reflected_ray(frame: Frame, column: int, row: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return origin [m] and unit direction, float64 [3], of a pixel's ray, mirrored where it hits if it does."""
+    """Return origin [m] and unit direction, each float64 [3], of a pixel's ray after its reflection, if it hits."""
     camera = frame.camera
-    (direction,) = camera.directions([(column + 0.5, row + 0.5)])
+    (direction,) = camera.directions(np.array([(column + 0.5, row + 0.5)]))
     normal = frame.numpy("normal")[row, column].astype(np.float64)
     length = np.linalg.norm(normal)  # below 1 where samples of a pixel differ
     if length == 0 or not np.isfinite(frame.numpy("depth")[row, column]):
@@ -254,19 +266,23 @@ def _reflected_ray(frame: Frame, column: int, row: int) -> tuple[np.ndarray, np.
     return position + 1e-4 * distance * normal, direction - 2 * (direction @ normal) * normal
 
 
-def _telling_ray(frame: Frame, state: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ray of one of some pixels: better one that hits, that asks two to four probes, each for long."""
+def _telling_ray(frame: Frame, state: ProbeState) -> tuple[np.ndarray, np.ndarray]:
+    """Return the reflected ray of the pixel, of some that are tried, whose path shows most.
+
+    That is a ray that hits and asks two to four probes, each of which it looks at for long.
+    """
     width, height = frame.camera.resolution
     at = np.meshgrid(np.arange(1, 24, 2) * width // 24, np.arange(1, 16, 2) * height // 16)
     rays = [_reflected_ray(frame, int(x), int(y)) for x, y in zip(at[0].ravel(), at[1].ravel(), strict=True)]
-    hits = march_rays(state, *(np.stack(values) for values in zip(*rays, strict=True)))
+    origins, directions = (np.stack(values) for values in zip(*rays, strict=True))
+    hits = march_rays(state, origins, directions)
     probes, blocks = hits["counts"][:, 2], hits["counts"][:, 1]
     value = 2.0 * (hits["results"] == int(march_kernels.HIT)) + ((probes > 1) & (probes <= 4)) + 1e-6 * blocks
     best = np.argsort(-value, kind="stable")[:CANDIDATES]
     best = best[value[best] > value[best[0]] - 0.5]
 
     def shortest(ray: int) -> int:
-        """Return the blocks that the probe looked at least in was asked for."""
+        """Return the number of blocks that a ray looks at in the probe where it looks at the fewest."""
         looks, _ = ray_looks(state, *rays[ray])
         visits = [look.visit for look in looks if look.level]
         return min((visits.count(look.visit) for look in looks), default=0)

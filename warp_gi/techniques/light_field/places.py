@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -19,41 +19,45 @@ from warp_gi import launch
 from warp_gi.errors import OptionError
 from warp_gi.kernels import light_field_place as kernels
 from warp_gi.kernels import types
+from warp_gi.kernels.light_field import LightField
 from warp_gi.paths import sky_probability
+from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.pinhole import camera_data
+from warp_gi.scene.scene import Scene
+from warp_gi.techniques.light_field.settings import FEW_PROBES, MOST_PROBES, ProbeSettings
 
 AUTOMATIC_PROBES = 440
-"""Most that there are where neither counts nor spacing are given."""
-ROOM_PROBES, UNSEEN_PROBES = 100, 128
-"""The same in rooms, where more of them come out darker (`bench/NOTES.md`), and where no camera says what is seen."""
+"""Largest number of probes where neither counts nor spacing are given."""
+ROOM_PROBES, UNSEEN_PROBES = 100, FEW_PROBES
+"""Largest number of probes, without counts and spacing, in rooms, where more probes make the picture darker
+(`bench/NOTES.md`), and where no camera says what is seen."""
 ROOM_SHARE = 0.06
-"""A camera is in a room if fewer of the ways from what it sees, and on from there, lead out of the scene."""
-FEW_RESOLUTION, MANY_RESOLUTION = 128, 64
-"""Texels along a side of a map unless told: of up to ``UNSEEN_PROBES`` probes, and of more."""
+"""Share of path edges out of the scene below which a camera counts as in a room, among the edges that leave what it
+sees and what is lit from there."""
 AUTOMATIC_STEPS = 12
 """Distances between probes along the longest side of the box, if that does not make too many of them."""
 REACH_PATHS, REACH_CAMERAS, LEAST_REACHED = 40_000, 32, 400
-"""Paths that say what a camera reaches, most frames of a camera path that they start in, and points without which they
-say nothing: nearly all of them left the scene."""
+"""Paths that find what a camera reaches; largest number of frames of a camera path that they start in; and number of
+points that they must find: with fewer, nearly all paths left the scene, and the result is not used."""
 REACH_QUANTILE, REACH_MORE = 0.005, 0.1
-"""Share of the points that may lie outside of the box on each side, for some windows look far; and how far first hits
-among them widen it all the same, in sizes of the box."""
+"""Share of the points that may lie outside of the box on each side, as windows may show what is far away; and how much
+wider first hits among those points make the box, as a share of its size."""
 INSET = 0.3
-"""Distance of the outermost probes from the border, in distances between probes: where points by a wall have a probe
-near and light is as it is in the room. At 0.5 rooms come out 5 to 10 % too bright; at 0.2 grids lose
-light in niches and behind curtains."""
-MOST_PROBES = 1 << 20
+"""Distance of the outermost probes from the border of the box, in distances between probes. It leaves points by a wall
+a probe nearby that has the light of the room. At 0.5 rooms come out 5 to 10 % too bright; at 0.2 light is lost in
+niches and behind curtains."""
 MOST_TEXELS = (1 << 31) - 1
-"""Of all maps together: kernels count them in 32 bits."""
+"""Largest number of texels of all maps together, which kernels count in 32 bits."""
 CLEARANCE = 0.1
-"""Share of the smallest distance between probes that a moved probe keeps from walls."""
+"""Distance that a moved probe keeps from walls, as a share of the smallest distance between probes."""
 SLABS, LOOKS = 24, 24
-"""Points along each axis, and directions from each, that find out where light is."""
+"""Points along each axis, and directions from each point, that are tried to find out where light is."""
 FREE_SHARE, LIT_SHARE, SLAB_SHARE = 0.25, 0.05, 0.1
-"""A point counts if it sees fewer back faces, and this share of the light of the brighter ones; a slab, with this share
-of the points of the best one."""
+"""Limits by which the lit space is found: largest share of a point's directions that meet back faces; least light of a
+point, as a share of that of brighter points; least number of such points in a slab, as a share of the best slab's."""
 PLACE_LOOKS = 256
+"""Directions in which a probe looks for walls before it moves."""
 INWARD_STEPS = (0.0, 0.25, 0.5)
 """Distances between probes that one at the border may move inward along an axis."""
 
@@ -63,9 +67,9 @@ class ProbeGrid:
     """Where probes stand: on a regular grid over the scene."""
 
     low: np.ndarray
-    """float64 [3], metres: probe (0, 0, 0)."""
+    """float64 [3], metres: position of probe (0, 0, 0)."""
     spacing: np.ndarray
-    """float64 [3], metres."""
+    """float64 [3], metres: distance between probes along x, y, z."""
     counts: tuple[int, int, int]
     """Probes along x, y, z."""
 
@@ -75,7 +79,7 @@ class ProbeGrid:
         return math.prod(self.counts)
 
     def positions(self) -> np.ndarray:
-        """Return float64 [probe, 3], x fastest, then y."""
+        """Return the positions of all probes, float64 [probe, 3], metres; x changes fastest, then y."""
         z, y, x = np.meshgrid(*(np.arange(n) for n in self.counts[::-1]), indexing="ij")
         return self.low + np.stack([x, y, z], axis=-1).reshape(-1, 3) * self.spacing
 
@@ -93,10 +97,11 @@ def probe_grid(
     least = 1 if spacing else 2  # eight probes around every point, unless told otherwise
     step = spacing or float(extent.max()) / AUTOMATIC_STEPS
 
-    def along(step: float) -> tuple[int, ...]:
+    def along(step: float) -> tuple[int, int, int]:
         rounded = round if spacing else math.ceil
         steps = np.minimum(extent / step, 1e9)
-        return tuple(int(n) or max(least, rounded(e)) for n, e in zip(counts, steps, strict=True))
+        x, y, z = (int(n) or max(least, rounded(e)) for n, e in zip(counts, steps, strict=True))
+        return x, y, z
 
     if not spacing and not all(counts):
         while math.prod(along(step)) > most and step < extent.max():
@@ -113,11 +118,13 @@ def probe_grid(
     return ProbeGrid((low + high) / 2 - cells * (numbers - 1) / 2, cells, found)
 
 
-def place_grid(scene: Any, settings: Any, camera: Camera | CameraPath | None, device: wp.Device) -> ProbeGrid:
-    """Return the grid of a LightFieldProbes for what a camera reaches; without one the scene's own do.
+def place_grid(
+    scene: Scene, settings: ProbeSettings, camera: Camera | CameraPath | None, device: wp.Device
+) -> ProbeGrid:
+    """Return the grid over what a camera reaches; the scene's own cameras stand for one that is None.
 
-    Where there is none, or none that sees anything, light says what is worth a probe, and there are fewer of them.
-    Raises OptionError for more probes than can be held.
+    Without any camera that sees something, the grid lies over the space that light reaches (``lit_bounds``), and has
+    fewer probes. Raises OptionError for more probes than can be held.
     """
     seen = seen_space(scene, cameras_of(camera) or list(scene.cameras.values()), device)
     if seen is None:
@@ -127,13 +134,8 @@ def place_grid(scene: Any, settings: Any, camera: Camera | CameraPath | None, de
     return probe_grid(box, settings.counts, settings.spacing, settings.largest_map, most)
 
 
-def map_resolution(resolution: int, probes: int) -> int:
-    """Return the texels along a side of a map that a setting of ``resolution`` means for so many probes."""
-    return resolution or (FEW_RESOLUTION if probes <= UNSEEN_PROBES else MANY_RESOLUTION)
-
-
 def cameras_of(camera: Camera | CameraPath | None, every: bool = False) -> list[Camera]:
-    """Return where a camera is over its whole path: in ``every`` frame, or in some evenly over it."""
+    """Return the cameras of a path's frames: of ``every`` frame, or of ``REACH_CAMERAS`` frames spread over it."""
     if camera is None:
         return []
     if isinstance(camera, Camera):
@@ -144,7 +146,7 @@ def cameras_of(camera: Camera | CameraPath | None, every: bool = False) -> list[
 
 
 def camera_rows(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return what decides what cameras see but for their pictures' shape, float32 [camera, 13]."""
+    """Return placement and field of view of cameras, float32 [camera, 13], but not the shape of their pictures."""
     rows = [[*camera.world_from_camera[:3].ravel(), camera.hfov] for camera in cameras]
     return np.array(rows, np.float32).reshape(-1, 13)
 
@@ -153,12 +155,12 @@ class Space(NamedTuple):
     """What paths from a camera reach."""
 
     bounds: np.ndarray
-    """float64 [2, 3], metres."""
+    """Box around the points that paths meet: float64 [2, 3], metres."""
     leaving: float
-    """Share of the ways from what the paths meet that lead out of the scene."""
+    """Share of the edges that lead out of the scene, among those from points that the paths met."""
 
 
-def seen_space(scene: Any, cameras: Sequence[Camera], device: wp.Device) -> Space | None:
+def seen_space(scene: Scene, cameras: Sequence[Camera], device: wp.Device) -> Space | None:
     """Return the box around what paths from cameras meet; None if that is nothing.
 
     Points count by one over their distance from the camera: a surface twice as far shows half the detail, and a plane
@@ -180,28 +182,28 @@ def seen_space(scene: Any, cameras: Sequence[Camera], device: wp.Device) -> Spac
         first.append((np.arange(len(met)) % along == 0)[met])
     if sum(map(len, points)) < LEAST_REACHED:
         return None
-    at, weight, is_first = np.concatenate(points), np.concatenate(weights), np.concatenate(first)
-    box = np.stack([_quantiles(at[:, axis], weight) for axis in range(3)], axis=1)
+    places, weight, is_first = np.concatenate(points), np.concatenate(weights), np.concatenate(first)
+    box = np.stack([_quantiles(places[:, axis], weight) for axis in range(3)], axis=1)
     more = REACH_MORE * (box[1] - box[0])
-    seen = at[is_first]
+    seen = places[is_first]
     low, high = np.maximum(seen.min(axis=0), box[0] - more), np.minimum(seen.max(axis=0), box[1] + more)
     return Space(np.stack([np.minimum(box[0], low), np.maximum(box[1], high)]), left / max(ways, 1))
 
 
 def _quantiles(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the two values outside of which lies ``REACH_QUANTILE`` of the weight, each."""
+    """Return two values, float64 [2]: below the first and above the second lies ``REACH_QUANTILE`` of the weight."""
     order = np.argsort(values, kind="stable")
     share = np.cumsum(weights[order])
     return np.interp([REACH_QUANTILE * share[-1], (1 - REACH_QUANTILE) * share[-1]], share, values[order])
 
 
-def lit_bounds(scene: Any, device: wp.Device) -> np.ndarray:
+def lit_bounds(scene: Scene, device: wp.Device) -> np.ndarray:
     """Return the box around the space that light reaches, float64 [2, 3], for scenes that no camera looks at.
 
     Bounds of a room reach behind its walls, to lamps above the ceiling and trees before the window, where probes would
-    be of no use. Of points in them, on a regular grid, those that see few back faces and a good share of the light
-    that points of the same scene see count, and the box is that of the slabs in which there are enough. It is the
-    scene's bounds if nothing is lit, or if there are emitters that move.
+    be of no use. Points on a regular grid in the bounds count as lit if they see few back faces, and a good share of
+    the light that the scene's brighter points see; the box is that of the slabs in which enough points are lit. It is
+    the scene's bounds if nothing is lit, or if emitters move.
     """
     bounds = scene.bounds.astype(np.float64)
     if _lights_move(scene):
@@ -226,9 +228,9 @@ def lit_bounds(scene: Any, device: wp.Device) -> np.ndarray:
     return box
 
 
-def _light_at(scene: Any, data: types.SceneData, points: np.ndarray, device: wp.Device) -> np.ndarray:
-    """Return the light from each of some directions [point, LOOKS]; -1 for those that meet back faces."""
-    array = wp.array(points.astype(np.float32), dtype=wp.vec3, device=device)
+def _light_at(scene: Scene, data: types.SceneData, points: np.ndarray, device: wp.Device) -> np.ndarray:
+    """Return the light from each of some directions, float64 [point, LOOKS]; -1 for those that meet back faces."""
+    array: wp.array = wp.array(points.astype(np.float32), dtype=wp.vec3, device=device)
     light = wp.empty(len(points) * LOOKS, dtype=wp.float32, device=device)
     inputs = [data, array, LOOKS, sky_probability(scene), light]
     launch.launch(kernels.measure_light, len(light), inputs, device)
@@ -236,6 +238,7 @@ def _light_at(scene: Any, data: types.SceneData, points: np.ndarray, device: wp.
 
 
 def _is_free(light: np.ndarray) -> np.ndarray:
+    """Return whether points see few back faces, bool [point]."""
     return (light < 0).mean(axis=1) < FREE_SHARE
 
 
@@ -246,15 +249,15 @@ def _typical(light: np.ndarray) -> float:
 
 
 def _is_lit(light: np.ndarray, typical: float) -> np.ndarray:
-    """Return bool [point]; a single bright direction, which another point may miss, counts no more than others."""
+    """Return whether points are lit, bool [point]; a single bright direction counts no more than others."""
     return _is_free(light) & (np.clip(light, 0, typical).mean(axis=1) > LIT_SHARE * typical)
 
 
-def relocate(scene: Any, data: types.SceneData, grid: ProbeGrid, field: Any, device: wp.Device) -> None:
-    """Move probes of a LightField out of walls and away from them, by up to half the distance to the next probe.
+def relocate(scene: Scene, data: types.SceneData, grid: ProbeGrid, field: LightField, device: wp.Device) -> None:
+    """Move probes of a field out of walls and away from them, by up to half the distance to the next probe.
 
-    Those at the border of the grid that no light reaches, in a niche or behind a wall, move inward to where some does,
-    if it does so near enough.
+    Probes at the border of the grid that no light reaches, in a niche or behind a wall, move inward to a place that is
+    lit, if there is one near enough. ``field`` gets new positions.
     """
     most, clearance = wp.vec3(*(0.5 * grid.spacing)), CLEARANCE * float(grid.spacing.min())
     inputs = [data, field, most, clearance, PLACE_LOOKS]
@@ -278,17 +281,17 @@ def relocate(scene: Any, data: types.SceneData, grid: ProbeGrid, field: Any, dev
     field.positions = wp.array(positions.astype(np.float32), dtype=wp.vec3, device=device)
 
 
-def _lights_move(scene: Any) -> bool:
+def _lights_move(scene: Scene) -> bool:
     """Return whether an emitter moves."""
     emits = [any(max(mesh.material.emission) > 0 for mesh in node.meshes) for node in scene.nodes]
     carried = {light.node for light in scene.lights}
     return any(scene.moves(index) and (emits[index] or index in carried) for index in range(len(scene.nodes)))
 
 
-def lit_data(scene: Any, device: wp.Device) -> types.SceneData:
+def lit_data(scene: Scene | BakedScene, device: wp.Device) -> types.SceneData:
     """Return the scene's buffers with emitters picked by power, whatever the pipeline's estimator of them does."""
     data = launch.copied(scene.data(device), types.SceneData)
     data.emitters = launch.copied(data.emitters, types.Emitters)
-    if scene.emitter_count:
+    if not isinstance(scene, BakedScene) and scene.emitter_count:
         data.emitters.alias = scene.light_table(device)
     return data

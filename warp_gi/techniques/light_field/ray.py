@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import colorsys
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -15,45 +15,52 @@ from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_march as march_kernels
 from warp_gi.sequence.preview import tone_map
 from warp_gi.techniques.light_field.export import unpack_radiance
+from warp_gi.techniques.light_field.state import ProbeState
 from warp_gi.techniques.shared.legends import with_keys
 from warp_gi.techniques.shared.octahedral import encode, texels_of
 
+if TYPE_CHECKING:
+    from PIL.ImageDraw import ImageDraw as Drawing
+
 PANEL_PIXELS = 768
-"""Along a side of each map that a ray is drawn in, about."""
+"""Pixels along a side of each map that a ray is drawn in, about."""
 PICTURE_PIXELS = 2600
-"""Across a picture of several maps, at most."""
+"""Largest width in pixels of a picture of several maps."""
 MOST_PANELS, MOST_LOOKS = 8, 4000
-"""Of a ray's path that are drawn."""
+"""Largest numbers of maps and of looks of a ray's path that are drawn."""
 # orange and green as in the paper's figure
 COARSE_COLOR, FINE_COLOR, HIT_COLOR, LINE_COLOR = (240, 140, 0), (60, 230, 60), (220, 30, 60), (255, 255, 255)
 LOST_COLOR = (120, 120, 120)
 NO_LIMIT = 1 << 30
-_DIMMED = 0.6  # of the map below the path
-_SMOOTH = 2  # pixels of a drawing in one of the picture
+"""Steps after which a ray stops that nothing else stops."""
+_DIMMED = 0.6  # brightness of the map below the path
+_SMOOTH = 2  # pixels of a drawing along a side of one of the picture's
 
 
 def probe_color(probe: int) -> tuple[int, int, int]:
-    """Return the colour, sRGB 0 to 255, that stands for a probe: unlike that of the next ones."""
+    """Return the colour, sRGB 0 to 255, that stands for a probe; probes of near numbers have unlike colours."""
     r, g, b = colorsys.hsv_to_rgb(probe * 0.618034 % 1.0, (0.85, 0.55)[probe % 2], (1.0, 0.85, 0.95)[probe % 3])
     return round(255 * r), round(255 * g), round(255 * b)
 
 
 def march_rays(
-    state: Any, origins: np.ndarray, directions: np.ndarray, most_steps: int = NO_LIMIT
+    state: ProbeState, origins: np.ndarray, directions: np.ndarray, most_steps: int = NO_LIMIT
 ) -> dict[str, np.ndarray]:
-    """Return what rays meet in a ProbeState, by the names of the fields of ``MarchHits``, each [ray, ...].
+    """Return what rays meet in the maps of probes, by the names of the fields of ``MarchHits``, each [ray, ...].
 
     Args:
-        state: Of the probes.
+        state: State of the probes.
         origins: float [ray, 3], metres.
         directions: float [ray, 3], unit vectors.
-        most_steps: Blocks and texels after which a ray stops, with the result ``STOPPED``.
+        most_steps: Number of blocks and texels after which a ray stops, with the result ``STOPPED``.
     """
     count, device = len(origins), state.device
     hits = march_kernels.MarchHits()
     for name, variable in march_kernels.MarchHits.vars.items():
         setattr(hits, name, wp.empty(count, dtype=variable.type.dtype, device=device))
-    rays = [wp.array(np.asarray(v, np.float32), dtype=wp.vec3, device=device) for v in (origins, directions)]
+    rays: list[wp.array] = [
+        wp.array(np.asarray(v, np.float32), dtype=wp.vec3, device=device) for v in (origins, directions)
+    ]
     inputs = [state.field, *rays, float("inf"), most_steps, hits]
     launch.launch(march_kernels.march_rays, count, inputs, device)
     return {name: getattr(hits, name).numpy() for name in march_kernels.MarchHits.vars}
@@ -64,21 +71,22 @@ class Look:
     """A block or a texel that a ray was tested against."""
 
     visit: int
-    """Number of probes asked until then, this one included."""
+    """Number of probes that the ray has asked so far, this one included."""
     probe: int
+    """Index of the probe that is asked."""
     level: int
     """1 for a block, 0 for a texel."""
     cell: int
-    """Its index in the probe's map, row by row."""
+    """Index of the block or texel in the probe's map, row by row."""
     t: float
-    """Metres along the ray, where it enters."""
+    """Distance along the ray at which it enters, metres."""
 
 
-def ray_looks(state: Any, origin: np.ndarray, direction: np.ndarray) -> tuple[list[Look], dict[str, Any]]:
-    """Return what a ray is tested against, at most the first ``MOST_LOOKS``, and the hit.
+def ray_looks(state: ProbeState, origin: np.ndarray, direction: np.ndarray) -> tuple[list[Look], dict[str, Any]]:
+    """Return what a ray is tested against, at most the first ``MOST_LOOKS`` blocks and texels, and the hit.
 
-    The march itself says what it looks at: it is stopped after one look, after two, and so on. ``origin`` [m] and
-    ``direction`` (unit) are float [3]; the hit has the fields of ``MarchHits``.
+    They are found by stopping the march after one look, after two, and so on. ``origin`` [m] and ``direction`` (unit)
+    are float [3]; the hit has the fields of ``MarchHits``.
     """
     origin, direction = np.asarray(origin, np.float64), np.asarray(direction, np.float64)
     resolution, positions = state.resolution, state.field.positions.numpy()
@@ -103,17 +111,17 @@ def ray_looks(state: Any, origin: np.ndarray, direction: np.ndarray) -> tuple[li
     return looks, hit
 
 
-def draw_ray(state: Any, origin: np.ndarray, direction: np.ndarray, exposure: float = 0.0) -> np.ndarray:
+def draw_ray(state: ProbeState, origin: np.ndarray, direction: np.ndarray, exposure: float = 0.0) -> np.ndarray:
     """Return the path of a ray through the radiance maps of the probes that it asks, uint8 [height, width, 3].
 
     Args:
-        state: The ProbeState of a frame (``FrameScheduler.state("indirect")``) or of a bake
-            (``LightFieldProbes.start``).
+        state: State of a frame (``FrameScheduler.state("indirect")``) or of a bake (``LightFieldProbes.start``).
         origin: float [3], metres.
         direction: float [3], of any length above zero.
-        exposure: Of the radiance, in stops.
+        exposure: Exposure of the radiance, in stops.
 
-    At most ``MOST_PANELS`` probes are drawn, the first ones. Raises OptionError for a ray that is none.
+    Of more than ``MOST_PANELS`` probes the first ones are drawn. Raises OptionError unless origin and direction are
+    three finite numbers each, and the direction is above zero.
     """
     origin, direction = np.asarray(origin, np.float64), np.asarray(direction, np.float64)
     length = float(np.linalg.norm(direction))
@@ -143,16 +151,17 @@ def draw_ray(state: Any, origin: np.ndarray, direction: np.ndarray, exposure: fl
     told += f"{_count(probes, 'probe')} asked, {_count(blocks, 'block')} and {_count(steps, 'texel')} looked at"
     if len(visits) > len(panels) and looks:
         told += f"; the first {len(panels)} probes are shown"
-    keys = ((COARSE_COLOR, "block of 16 x 16 texels looked at"), (FINE_COLOR, "texel looked at"))
-    keys += ((LINE_COLOR, "the ray, from its white dot on"),)
-    if result != int(march_kernels.MISS):
-        keys += (
-            (HIT_COLOR, "where it hits") if result == int(march_kernels.HIT) else (LOST_COLOR, "where it is lost"),
-        )
-    return with_keys(_arranged(panels), keys, told)
+    keys = [(COARSE_COLOR, "block of 16 x 16 texels looked at"), (FINE_COLOR, "texel looked at")]
+    keys.append((LINE_COLOR, "the ray, from its white dot on"))
+    if result == int(march_kernels.HIT):
+        keys.append((HIT_COLOR, "where it hits"))
+    elif result != int(march_kernels.MISS):
+        keys.append((LOST_COLOR, "where it is lost"))
+    return with_keys(_arranged(panels), tuple(keys), told)
 
 
 def _end(result: int, t: float) -> str:
+    """Return in words how a ray's march ends."""
     if result == int(march_kernels.MISS):
         return "meets nothing"
     return f"hits after {t:.3g} m" if result == int(march_kernels.HIT) else "is lost: no probe sees further"
@@ -176,7 +185,7 @@ def _numbers(values: np.ndarray) -> str:
 
 
 def _panel(
-    state: Any,
+    state: ProbeState,
     looks: list[Look],
     origin: np.ndarray,
     direction: np.ndarray,
@@ -184,7 +193,7 @@ def _panel(
     end_color: tuple[int, int, int] | None,
     exposure: float,
 ) -> np.ndarray:
-    """Return the map of the probe of ``looks`` with them and the ray over it, and a caption below."""
+    """Return a probe's map with the ``looks`` at it and the ray drawn over it, and a caption below."""
     from PIL import Image, ImageDraw
 
     probe, resolution, block = looks[0].probe, state.resolution, int(field_kernels.BLOCK)
@@ -229,19 +238,23 @@ def _panel(
 
 
 def _cell_box(cell: int, across: int, size: int) -> tuple[int, int, int, int]:
-    """Return the corners of a cell, ``size`` pixels wide, of a map of ``across`` cells a side."""
+    """Return x and y of the corners of a cell, ``size`` pixels wide, in a map of ``across`` cells a side."""
     x, y = cell % across * size, cell // across * size
     return x, y, x + size - 1, y + size - 1
 
 
-def _draw_dot(draw: Any, at: np.ndarray, radius: int, color: tuple[int, int, int]) -> None:
+def _draw_dot(draw: Drawing, at: np.ndarray, radius: int, color: tuple[int, int, int]) -> None:
     for r, fill in ((radius + 1, (0, 0, 0)), (radius, (255, 255, 255)), (radius - 2, color)):
         draw.ellipse((*(at - r * _SMOOTH), *(at + r * _SMOOTH)), fill=(*fill, 255))
 
 
 def _line_on_map(origin: np.ndarray, direction: np.ndarray, t_start: float, t_end: float) -> np.ndarray:
-    """Return coordinates in [0, 1], [point, 2], of a ray about a probe, at even angles as the probe sees them."""
+    """Return where points of a ray lie on a probe's map, float64 [point, 2] in [0, 1].
+
+    The points are at even angles as the probe sees them; ``origin`` [m] is relative to the probe.
+    """
     nearest = -origin @ direction
     height = max(float(np.linalg.norm(origin + nearest * direction)), 1e-6)
-    angles = np.linspace(*np.arctan((np.array([t_start, max(t_end, t_start)]) - nearest) / height), 1000)
+    first, last = np.arctan((np.array([t_start, max(t_end, t_start)]) - nearest) / height)
+    angles = np.linspace(first, last, 1000)
     return encode(origin + (nearest + height * np.tan(angles))[:, None] * direction)

@@ -7,7 +7,6 @@ import logging
 import math
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -18,35 +17,41 @@ from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_bake as bake_kernels
 from warp_gi.kernels import path_trace, types
 from warp_gi.paths import sky_probability
+from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.camera import Camera, CameraPath
+from warp_gi.scene.scene import Scene
 from warp_gi.techniques.light_field.places import (
     ProbeGrid,
     camera_rows,
     cameras_of,
     lit_data,
-    map_resolution,
     place_grid,
     relocate,
 )
+from warp_gi.techniques.light_field.settings import ProbeSettings, map_resolution
 from warp_gi.techniques.paths.estimators import BsdfPaths
 from warp_gi.techniques.shared.octahedral import unfolded
 
 LIGHT_RESOLUTION, DISTANCE_RESOLUTION = 32, 64
-"""Texels along a side of what irradiance and moments are filtered from, each the mean over the texels in it."""
+"""Texels along a side of the smaller maps that irradiance and moments are filtered from; each is the mean over the
+texels of the large map that it covers."""
 SHARING_RESOLUTION, LAST_SHARING_RESOLUTION = 64, 128
-"""Texels along a side of a map that look irradiance up for themselves, while light bounces and at last."""
+"""Largest number of texels along a side of a map that look up irradiance for themselves, in all bounces but the last
+and in the last; finer maps share one lookup among several texels."""
 BIAS = 0.05
-"""Share of the smallest distance between probes by which a point leaves its surface before it asks who sees it."""
+"""Distance that a point is moved off its surface before probes are asked whether they see it, as a share of the
+smallest distance between probes."""
 COVERED_SHARE = 0.5
-"""A probe that sees back faces in more directions than this is inside of something."""
+"""Share of its directions that meet back faces above which a probe counts as inside of something."""
 LEAST_SEEN = 0.25
-"""Of the weights of the probes around a point, the share of those that see it, from which on its light is known: in
-niches and under stairs fewer do, and what they know is the light in front."""
+"""Least share of the weights of the eight probes around a point that must come from probes that see it. With less, in
+niches and under stairs, they know the light in front of it and not its own, which is then traced."""
 BATCH_TEXELS = 1 << 20
-"""Traced between two reports of progress."""
+"""Texels that are traced between two reports of progress."""
 ANNOUNCED_TEXELS, TRIED_PROBES, TYPICAL_BOUNCES = 1 << 18, 8, 10
-"""Texels from which on a bake says how long it takes, and by how many probes and bounces it finds out."""
-_WORK_BYTES = 9  # of ProbeWork a texel, beside emission
+"""Texels from which on a bake says how long it takes; and the number of probes and of bounces that it reckons with."""
+_WORK_BYTES = 9
+"""Bytes of ProbeWork a texel, without emission."""
 _log = logging.getLogger("warp_gi")
 
 
@@ -64,40 +69,56 @@ def low_directions(resolution: int) -> np.ndarray:
 
 
 class ProbeState:
-    """The probes of an estimator on a device, and how far they are behind the scene."""
+    """Probes on a device, and how far they are behind the scene.
+
+    ``bake``, ``fill``, ``refresh`` and ``take_stale`` change the state that they are called on, and are for a state
+    that no frame has yet. A frame calls ``take_stale`` and ``refresh`` on its own copy (``copied``), so that the state
+    of the last frame stays as it is. ``trace`` changes nothing.
+
+    Args:
+        scene: Scene that is rendered; a ``BakedScene`` needs a bake.
+        device: Where probes are filled and asked.
+        settings: What decides where probes stand and what they hold.
+        seed: Seed of all rays.
+        bake: Bake whose probes these are; None places them anew, and leaves them empty.
+        camera: Camera around whose view probes are placed anew.
+    """
 
     def __init__(
         self,
-        scene: Any,
+        scene: Scene | BakedScene,
         device: wp.Device,
-        settings: Any,
+        settings: ProbeSettings,
         seed: int,
         bake: Bake | None = None,
         camera: Camera | CameraPath | None = None,
     ) -> None:
         self.device, self.settings, self.seed, self.camera = device, settings, seed, camera
         if bake is None:
-            self.grid = place_grid(scene, settings, camera, device)
+            self.grid = place_grid(whole_scene(scene), settings, camera, device)
             bounds = scene.bounds
         else:
             arrays = bake.arrays
-            counts = tuple(int(n) for n in arrays["grid_counts"])
-            self.grid, bounds = ProbeGrid(arrays["grid_low"], arrays["grid_spacing"], counts), arrays["bounds"]
+            nx, ny, nz = (int(n) for n in arrays["grid_counts"])
+            self.grid, bounds = ProbeGrid(arrays["grid_low"], arrays["grid_spacing"], (nx, ny, nz)), arrays["bounds"]
         self.resolution = map_resolution(settings.resolution, self.grid.probe_count)
-        """Texels along a side of a map."""
+        """Texels along a side of a probe's map."""
         self.changes: list[float] = []
         """Change of the irradiance by each bounce, as a share of it."""
         self.key = ""
-        """Of the sky and the poses that the probes were last refreshed for."""
+        """Hash of the sky and bytes of the poses that the probes were last refreshed for."""
         self.refreshes = 0
+        """Number of calls of ``refresh`` so far, which the seed of the next one depends on."""
         self.pending = np.zeros(self.grid.probe_count, np.int32)
-        """Refreshes that each probe still needs."""
+        """int32 [probe]: refreshes that each probe still needs."""
         self._cursor = 0
+        """Probe whose turn it is to be refreshed."""
         self.field = self._empty_field(bounds.astype(np.float64))
+        """Maps and places of the probes as kernels read them."""
         if bake is not None:
             self._load(bake)
 
-    def _empty_field(self, bounds: np.ndarray) -> Any:
+    def _empty_field(self, bounds: np.ndarray) -> field_kernels.LightField:
         grid, settings = self.grid, self.settings
         count, texels = grid.probe_count, self.resolution**2
         margin = 1e-3 * float(np.linalg.norm(bounds[1] - bounds[0]))
@@ -123,12 +144,12 @@ class ProbeState:
         field.emission = wp.empty(0, dtype=wp.uint32, device=self.device)
         return field
 
-    def _array(self, values: np.ndarray, dtype: Any) -> wp.array:
+    def _array(self, values: np.ndarray, dtype: type) -> wp.array:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
 
     # ---- filling ----
 
-    def bake(self, scene: Any, progress: Callable[[float], None] | None = None) -> None:
+    def bake(self, scene: Scene, progress: Callable[[float], None] | None = None) -> None:
         """Place all probes, and fill them."""
         data = lit_data(scene, self.device)
         if self.settings.relocate:
@@ -136,7 +157,7 @@ class ProbeState:
         self._announce(scene, data)
         self.fill(scene, data, progress)
 
-    def _announce(self, scene: Any, data: types.SceneData) -> None:
+    def _announce(self, scene: Scene, data: types.SceneData) -> None:
         """Log how many probes there are, and what filling them takes: memory, and seconds if it is not a moment."""
         count, texels = self.grid.probe_count, self.resolution**2
         memory = self.nbytes + count * texels * (_WORK_BYTES + 4 * (scene.emitter_count > 0))
@@ -146,7 +167,7 @@ class ProbeState:
             text += f", about {max(self._seconds(scene, data), 1):.0f} s to bake"
         _log.info(text)
 
-    def _seconds(self, scene: Any, data: types.SceneData) -> float:
+    def _seconds(self, scene: Scene, data: types.SceneData) -> float:
         """Return about how many seconds it takes to fill the probes, by filling some of them once."""
         few = np.unique(np.linspace(0, self.grid.probe_count - 1, TRIED_PROBES).astype(int))
         work = self._work(few, 1, scene, with_emission=False)
@@ -160,7 +181,7 @@ class ProbeState:
         all_of = self.grid.probe_count / len(few)
         return all_of * (seconds[0] * self.settings.rays + seconds[1] * min(TYPICAL_BOUNCES, self.settings.bounces))
 
-    def fill(self, scene: Any, data: types.SceneData, progress: Callable[[float], None] | None = None) -> None:
+    def fill(self, scene: Scene, data: types.SceneData, progress: Callable[[float], None] | None = None) -> None:
         """Trace all probes where they stand, and let light bounce between them until it changes no more."""
         settings, told = self.settings, progress or (lambda share: None)
         every = np.arange(self.grid.probe_count)
@@ -181,8 +202,8 @@ class ProbeState:
         self._keep_emission(work)
         self.pending[:] = 0
 
-    def refresh(self, scene: Any, data: Any, probes: np.ndarray) -> None:
-        """Trace some probes again, and blend what they gather into their irradiance."""
+    def refresh(self, scene: Scene, data: types.SceneData, probes: np.ndarray) -> None:
+        """Trace some probes again, int [number], and blend what they gather into their irradiance."""
         work = self._work(probes, 1, scene, with_emission=scene.emitter_count > 0)
         self._trace(data, work, probes)
         self._find_covered(work)
@@ -192,17 +213,17 @@ class ProbeState:
         self.refreshes += 1
 
     def copied(self, with_maps: bool = False) -> ProbeState:
-        """Return a state that ``take_stale`` may change, and with maps of its own ``refresh``; this one stays."""
+        """Return a copy that ``take_stale`` may change, and ``refresh`` too if it gets maps of its own."""
         state = copy.copy(self)
         state.pending, state.field = self.pending.copy(), launch.copied(self.field, field_kernels.LightField)
-        for name in self.field._cls.vars if with_maps else ():
+        for name in field_kernels.LightField.vars if with_maps else ():
             value = getattr(self.field, name)
             if isinstance(value, wp.array):
                 setattr(state.field, name, wp.clone(value))
         return state
 
     def take_stale(self, most: int) -> np.ndarray:
-        """Return up to ``most`` probes that need a refresh, in turns, and count it as done."""
+        """Return up to ``most`` probes that need a refresh, int64 [number], in turns, and count that as done."""
         stale = np.flatnonzero(self.pending)
         stale = np.concatenate([stale[stale >= self._cursor], stale[stale < self._cursor]])[:most]
         self.pending[stale] -= 1
@@ -210,10 +231,11 @@ class ProbeState:
             self._cursor = int(stale[-1]) + 1
         return np.sort(stale)
 
-    def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any]) -> None:
+    def _launch(self, kernel: wp.Kernel, count: int, inputs: list[object]) -> None:
         launch.launch(kernel, count, inputs, self.device, smallest_slice=1)
 
-    def _work(self, probes: np.ndarray, rays: int, scene: Any, with_emission: bool) -> Any:
+    def _work(self, probes: np.ndarray, rays: int, scene: Scene, with_emission: bool) -> bake_kernels.ProbeWork:
+        """Return buffers for tracing some probes, int [number], with so many rays a texel."""
         texels, count = self.resolution**2, len(probes)
         work = bake_kernels.ProbeWork()
         work.probes = self._array(probes.astype(np.int32), wp.int32)
@@ -236,8 +258,13 @@ class ProbeState:
         return work
 
     def _trace(
-        self, data: Any, work: Any, probes: np.ndarray, told: Callable[[float], None] = lambda share: None
+        self,
+        data: types.SceneData,
+        work: bake_kernels.ProbeWork,
+        probes: np.ndarray,
+        told: Callable[[float], None] = lambda share: None,
     ) -> None:
+        """Trace the texels of some probes, int [number], and filter the distances that they find."""
         texels = self.resolution**2
         step = max(1, BATCH_TEXELS // texels)
         for start in range(0, len(probes), step):
@@ -250,7 +277,7 @@ class ProbeState:
         size = self.settings.irradiance_resolution**2
         self._launch(bake_kernels.filter_distances, len(probes) * size, [self.field, work])
 
-    def _bounce(self, work: Any, count: int, is_last: bool = False) -> None:
+    def _bounce(self, work: bake_kernels.ProbeWork, count: int, is_last: bool = False) -> None:
         """Let light bounce once, and set the radiance of all texels if it is for the last time."""
         work.is_last = int(is_last)
         shared = LAST_SHARING_RESOLUTION if is_last else SHARING_RESOLUTION
@@ -260,8 +287,8 @@ class ProbeState:
         size = self.settings.irradiance_resolution**2
         self._launch(bake_kernels.filter_light, count * size, [self.field, work])
 
-    def _find_covered(self, work: Any) -> None:
-        """Leave out probes that mostly see back faces, unless all do: then it is the faces that are the wrong way."""
+    def _find_covered(self, work: bake_kernels.ProbeWork) -> None:
+        """Leave out probes that mostly see back faces; if all probes do, the scene's faces are turned, and all stay."""
         probes = work.probes.numpy()
         back = (work.back.numpy() & int(bake_kernels.TEXEL_BACK)).reshape(len(probes), -1).mean(axis=1)
         states = self.field.states.numpy()
@@ -272,7 +299,7 @@ class ProbeState:
             states[:] = int(field_kernels.PROBE_USABLE)
         self.field.states = self._array(states, wp.int32)
 
-    def _keep_emission(self, work: Any) -> None:
+    def _keep_emission(self, work: bake_kernels.ProbeWork) -> None:
         """Keep the radiance of texels that see an emitter, by their index."""
         if work.emission.shape[0] == 0:
             return
@@ -289,8 +316,8 @@ class ProbeState:
 
     # ---- bakes ----
 
-    def to_bake(self, scene: Any) -> Bake:
-        """Return all that was baked."""
+    def to_bake(self, scene: Scene) -> Bake:
+        """Return the probes of a scene as a bake."""
         field, settings = self.field, self.settings
         names = ("positions", "states", "radiance", "surfels", "irradiance", "moments", "emission_texels", "emission")
         arrays = {name: getattr(field, name).numpy().copy() for name in names}
@@ -309,7 +336,7 @@ class ProbeState:
             "bytes": self.nbytes,
             **{f"change_{number + 1}": change for number, change in enumerate(self.changes)},
         }
-        return Bake("LightFieldProbes", scene.contents_hash, settings.bake_settings(scene), arrays, counts, scene.name)
+        return Bake("LightFieldProbes", scene.contents_hash, settings.stored(), arrays, counts, scene.name)
 
     def _load(self, bake: Bake) -> None:
         """Take over what a bake holds."""
@@ -338,7 +365,7 @@ def bounce_changes(bake: Bake) -> list[float]:
     return [float(bake.counts[f"change_{number + 1}"]) for number in range(count)]
 
 
-def path_settings(scene: Any) -> Any:
+def path_settings(scene: Scene | BakedScene) -> path_trace.PathSettings:
     """Return the settings of paths that go on where probes know nothing: those of a default BsdfPaths."""
     defaults, paths = BsdfPaths(), path_trace.PathSettings()
     paths.max_depth, paths.roulette_depth = defaults.max_depth, defaults.roulette_depth
@@ -351,14 +378,14 @@ def baked_resolution(bake: Bake) -> int:
     return math.isqrt(len(bake.arrays["surfels"]) // len(bake.arrays["positions"]))
 
 
-def sky_bytes(scene: Any) -> np.ndarray:
-    """Return the hash of the scene's sky, uint8; of zeros if there is none."""
+def sky_bytes(scene: Scene | BakedScene) -> np.ndarray:
+    """Return the hash of the scene's sky, uint8 [32]; zeros if there is none."""
     if scene.environment is None:
         return np.zeros(32, np.uint8)
     return np.frombuffer(bytes.fromhex(scene.environment.content_hash), np.uint8)
 
 
-def _part(work: Any, start: int, stop: int, texels: int) -> Any:
+def _part(work: bake_kernels.ProbeWork, start: int, stop: int, texels: int) -> bake_kernels.ProbeWork:
     """Return the work of slots ``start`` to ``stop`` - 1 alone, in the same memory."""
     part = launch.copied(work, bake_kernels.ProbeWork)
     part.probes = work.probes[start:stop]

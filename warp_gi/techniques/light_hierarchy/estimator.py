@@ -1,4 +1,4 @@
-"""Direct light from emitters that are selected by a hierarchy over them: the baseline of the light cache."""
+"""Direct light from emitters that a hierarchy over them selects: the baseline of the light cache."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ import warp as wp
 from warp_gi import launch
 from warp_gi.estimator import Ahead, Estimator
 from warp_gi.kernels import light_hierarchy
+from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.techniques.light_hierarchy import tree as light_tree
+from warp_gi.techniques.light_hierarchy.bounds import EmitterBounds, emitter_bounds
 
 if TYPE_CHECKING:
     from warp_gi.baking import Bake
     from warp_gi.frame import Frame
-    from warp_gi.scene.baked import BakedScene
     from warp_gi.scene.scene import Scene
 
 
 @dataclass(frozen=True)
 class LightHierarchy(Estimator):
-    """Direct light from emitters, selected at every point by how near, bright and turned to it they are. Unbiased.
+    """Direct light from emitters, selected at every point by distance, power and orientation. Unbiased.
 
     A tree over emitters with boxes and orientation cones, eight wide, is descended at random by importance (Conty
     Estevez and Kulla 2018, "Importance Sampling of Many Lights with Adaptive Tree Splitting", without splitting). It
@@ -60,21 +61,24 @@ class LightHierarchy(Estimator):
 
 @dataclass(frozen=True)
 class TreeState:
-    """The tree on the host and on the device, and the lights that it is around."""
+    """The tree of lights, and the bounds of the lights that it was made for."""
 
     tree: light_tree.TreeArrays
-    bounds: light_tree.EmitterBounds
+    """Tree on the host."""
+    bounds: EmitterBounds
+    """Bounds of the emitters that the tree's boxes and cones are around."""
     data: light_hierarchy.LightTree
+    """Tree as kernels read it."""
 
 
-def first_tree(scene: Scene, device: wp.Device) -> TreeState | None:
-    """Return the tree over a scene's lights as they are, at time 0 before the first frame; None if there are none.
+def first_tree(scene: Scene | BakedScene, device: wp.Device) -> TreeState | None:
+    """Return the tree over a scene's lights in their pose now, which is that at time 0; None without lights.
 
-    Its shape stays, so that frames do not depend on which of them was the first.
+    Later frames keep its topology, so that they do not depend on which frame was rendered first.
     """
     if scene.emitter_count == 0:
         return None
-    bounds = light_tree.emitter_bounds(scene, device)
+    bounds = emitter_bounds(whole_scene(scene), device)
     tree = light_tree.build_tree(bounds)
     return TreeState(tree, bounds, light_tree.to_device(tree, device))
 
@@ -82,12 +86,12 @@ def first_tree(scene: Scene, device: wp.Device) -> TreeState | None:
 def moved_tree(frame: Frame, state: TreeState) -> TreeState:
     """Return the tree with its boxes and cones around the lights of a frame."""
     if frame.scene.is_animated:
-        bounds = light_tree.emitter_bounds(frame.scene, frame.device)
+        bounds = emitter_bounds(whole_scene(frame.scene), frame.device)
         if not _same(bounds, state.bounds):
             tree = light_tree.refit_tree(state.tree, bounds)
             return TreeState(tree, bounds, light_tree.to_device(tree, frame.device))
     return state
 
 
-def _same(a: light_tree.EmitterBounds, b: light_tree.EmitterBounds) -> bool:
+def _same(a: EmitterBounds, b: EmitterBounds) -> bool:
     return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("low", "high", "axis"))

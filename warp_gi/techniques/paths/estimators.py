@@ -1,9 +1,9 @@
-"""The baselines. They share one path-tracing launch (``Frame.paths``)."""
+"""The baseline estimators. They share one path-tracing launch (``Frame.paths``)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import warp as wp
@@ -31,7 +31,7 @@ class TracedEnvironment(Estimator):
 
     term: ClassVar[str] = "environment"
 
-    def trace(self, frame: Frame, state: Any) -> None:
+    def trace(self, frame: Frame, state: None) -> None:
         """Ask the path tracer for this term."""
         frame.paths.want(self.term)
 
@@ -64,7 +64,7 @@ class PowerLights(Estimator):
 
     term: ClassVar[str] = "emitters"
 
-    def trace(self, frame: Frame, state: Any) -> None:
+    def trace(self, frame: Frame, state: None) -> None:
         """Ask the path tracer for this term; it picks lights by power unless told otherwise."""
         frame.paths.want(self.term)
 
@@ -79,13 +79,14 @@ class BsdfPaths(Estimator):
     term: ClassVar[str] = "indirect"
 
     max_depth: int = 64
-    """Edges of the longest path from camera to light: 2 is direct light only, 3 one bounce. In white rooms 8 loses 7 to
-    10 % of the indirect light and 24 loses 0.1 %. Roulette ends nearly all paths sooner, so 64 costs little more than
-    8: at most 7 % more time."""
+    """Number of edges of the longest path from camera to light: 2 is direct light only, 3 one bounce. In white rooms 8
+    loses 7 to 10 % of the indirect light and 24 loses 0.1 %. Roulette ends nearly all paths sooner, so 64 takes at most
+    7 % more time than 8."""
     roulette_depth: int = 5
-    """Paths of this many edges and more end at random, by their throughput or the reflectance they met, the larger."""
+    """Number of edges from which on a path may end at random (Russian roulette); it goes on with a probability that is
+    the larger of its throughput and the reflectance that it met."""
     clamp: float = 0.0
-    """Largest component of one path's radiance, W/(m^2 sr); darkens fireflies. 0 is no limit."""
+    """Largest component of one path's radiance, W/(m^2 sr), to which fireflies are darkened; 0 is no limit."""
     ends_in: RadianceCache | None = None
     """Radiance cache in which paths end at their second vertex, or None: direct light is sampled there as without
     it, and all other light is what the cache knows. Where it knows nothing a path goes on."""
@@ -103,9 +104,9 @@ class BsdfPaths(Estimator):
 
     @property
     def radiance_cache(self) -> RadianceCache | None:
-        """The cache that paths end in."""
+        """The radiance cache that paths end in, or None."""
         return self.ends_in
 
-    def trace(self, frame: Frame, state: Any) -> None:
+    def trace(self, frame: Frame, state: None) -> None:
         """Ask the path tracer for this term."""
         frame.paths.want(self.term, self.max_depth, self.roulette_depth, self.clamp)

@@ -27,30 +27,32 @@ BITS = (32, 64, 96, 128)
 class GuidedPaths(BsdfPaths):
     """Indirect light by path tracing, whose directions also come from a quadtree that each region learns.
 
-    A quadtree of a few bits holds where light came from in the frames before; directions by it and by the BSDF are
-    combined by the balance heuristic. Unbiased but for ``max_depth`` and ``clamp``. Every path vertex uses it.
+    A quadtree of a few bits holds where light came from in earlier frames. Directions that it proposes and directions
+    by the BSDF are combined by the balance heuristic, at every path vertex. Unbiased but for ``max_depth`` and
+    ``clamp``.
     """
 
     term: ClassVar[str] = "indirect"
 
     bits: int = 128
-    """Of one quadtree: 32, 64, 96 or 128."""
+    """Size of one quadtree in bits: 32, 64, 96 or 128."""
     migrations: int = 8
-    """Leaves of a quadtree that may move in a frame; 1 in the paper."""
+    """Largest number of leaves of a quadtree that move in a frame; 1 in the paper."""
     significance: float = 0.5
-    """Leaves move only where what there is to gain by splitting one, times this, exceeds what is lost by giving up
-    four: area times squared light."""
+    """A leaf is split, and four others are merged, only if significance * gain > loss, both measured as
+    area * radiance^2."""
     fading: float = 0.5
-    """Share that the light of earlier frames keeps in what a quadtree adapts to, more where samples are few; 0 is the
-    last frame alone."""
+    """Weight of earlier frames in the light that a quadtree adapts to, from 0 (the last frame alone) to below 1; where
+    samples are few it is raised."""
     bsdf_share: float = 0.5
-    """Share of directions by the BSDF: the first one, and the only one unless ``adapts_share``."""
+    """Probability of sampling a direction by the BSDF. With ``adapts_share`` it is only the initial value."""
     adapts_share: bool = True
-    """Whether each region learns the share that its samples would have varied least with."""
+    """Whether each region learns the probability with which its samples would have varied least."""
     stratified: bool = True
-    """Whether two numbers are warped top-down, which keeps them stratified, or a third picks a leaf as in the paper."""
+    """How a direction is drawn from a quadtree: by warping two numbers from the root down, which keeps them stratified
+    (True), or by a third number that picks a leaf, as in the paper (False)."""
     samples: int = 2048
-    """Samples a region that are looked at, each frame."""
+    """Largest number of samples that a region learns from in a frame."""
 
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
@@ -68,12 +70,12 @@ class GuidedPaths(BsdfPaths):
 
     @property
     def services(self) -> tuple[Service, ...]:
-        """Regions, and samples in them."""
+        """The octree of regions, which also sorts a frame's samples by region."""
         return (SampleOctree(),)
 
     @property
     def saves_state(self) -> bool:
-        """The quadtrees hold all that frames before left."""
+        """True: the quadtrees hold all that earlier frames left."""
         return True
 
     def bake_key(self, scene: Scene | BakedScene) -> str:
@@ -82,14 +84,14 @@ class GuidedPaths(BsdfPaths):
 
     def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> GuideState:
         """Return even quadtrees for the eight leaves of the first octree."""
-        device = launch.get_device(device)
-        guides = _guides(8, self.bits, device)
+        target = launch.get_device(device)
+        guides = _guides(8, self.bits, target)
         guides.trees.fill_(wp.vec4ui(*quadtree.quadtree_uniform(self.bits)))
         guides.shares.fill_(wp.vec2(self.bsdf_share, self.bsdf_share))
-        return self._counted(guides, device)
+        return self._counted(guides, target)
 
     def preprocess(self, frame: Frame, state: GuideState) -> GuideState:
-        """Give paths the quadtrees."""
+        """Let paths draw directions from the quadtrees, and return the state as it is."""
         data = guided_directions.GuidedDirections()
         data.bits, data.stratified = self.bits, int(self.stratified)
         data.trees, data.shares, data.counts = state.guides.trees, state.guides.shares, state.counts
@@ -98,12 +100,12 @@ class GuidedPaths(BsdfPaths):
         return state
 
     def after(self, frame: Frame, state: GuideState) -> GuideState:
-        """Learn from the samples of the frame."""
+        """Return quadtrees that learnt from the samples of the frame, if any were kept."""
         lesson = frame.offered(Lesson)
         return state if lesson is None else self.learn(lesson, state)
 
     def learn(self, lesson: Lesson, state: GuideState) -> GuideState:
-        """Adapt the quadtrees to the samples of the frame."""
+        """Return quadtrees for the next frame's leaves, adapted to the samples of this one."""
         device = lesson.device
         if lesson.octree.leaf_count * 4 * self.bits >= 1 << 31:
             raise OptionError(
@@ -127,6 +129,7 @@ class GuidedPaths(BsdfPaths):
         return GuideState(guides, adaptation.counts)
 
     def _adaptation(self, guides: guided_shares.GuideKnowledge, device: wp.Device) -> quadtree_adapt.QuadtreeAdaptation:
+        """Return the settings of an adaptation of quadtrees, with room for its counts."""
         leaves = guides.trees.shape[0]
         adaptation = quadtree_adapt.QuadtreeAdaptation()
         adaptation.bits, adaptation.migrations = self.bits, self.migrations
@@ -137,7 +140,7 @@ class GuidedPaths(BsdfPaths):
         return adaptation
 
     def _counted(self, guides: guided_shares.GuideKnowledge, device: wp.Device) -> GuideState:
-        """Return the state of quadtrees as they are."""
+        """Return a state of quadtrees as they are, with the counts that follow from them."""
         adaptation = self._adaptation(guides, device)
         none = quadtree_adapt.QuadtreeSamples()
         leaves = guides.trees.shape[0]
@@ -148,14 +151,16 @@ class GuidedPaths(BsdfPaths):
 
 @dataclass
 class GuideState:
-    """What every region knows of directions."""
+    """What every region knows of directions. No call changes a state; each returns a new one."""
 
     guides: guided_shares.GuideKnowledge
+    """Quadtrees, shares of directions by the BSDF, and what both are learnt from, by leaf of the octree."""
     counts: wp.array
-    """uint32 [leaf * bits / 4], which follows from the trees."""
+    """uint32 [leaf * bits / 4]: numbers of leaves below nodes of the quadtrees, which follow from the trees."""
 
 
 def _guides(leaves: int, bits: int, device: wp.Device) -> guided_shares.GuideKnowledge:
+    """Return arrays for so many leaves of the octree; trees and shares are yet to be filled."""
     guides = guided_shares.GuideKnowledge()
     guides.trees = wp.empty(leaves, dtype=wp.vec4ui, device=device)
     guides.shares = wp.empty(leaves, dtype=wp.vec2, device=device)

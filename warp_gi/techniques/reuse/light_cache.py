@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 import warp as wp
@@ -13,6 +13,7 @@ from warp_gi.alias import AliasTable
 from warp_gi.errors import OptionError, check_whole, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.kernels import light_cache, light_cache_build, light_cache_native
+from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.emitters import PlacedEmitters
 from warp_gi.techniques.light_hierarchy.estimator import TreeState, first_tree, moved_tree
 from warp_gi.techniques.reuse.sample_octree import Lesson, SampleOctree, running_sums
@@ -21,49 +22,54 @@ from warp_gi.techniques.shared.ltc import ltc_table
 if TYPE_CHECKING:
     from warp_gi.baking import Bake
     from warp_gi.frame import Frame
-    from warp_gi.scene.baked import BakedScene
+    from warp_gi.scene.camera import Camera
     from warp_gi.scene.scene import Scene
     from warp_gi.service import Service
 
 EXPLORES_BY = ("hierarchy", "table")
 LEAST_EXPLORATION, MOST_EXPLORATION = 0.05, 0.75
-MOVING_EXPLORATION = 0.3  # least share in a frame whose lights are not where they were
-MOST_EMITTERS = 1 << 23  # entries of lists have 23 bits for them
+"""Range of the probability of exploring that a region learns."""
+MOVING_EXPLORATION = 0.3
+"""Least probability of exploring in a frame in which lights move."""
+MOST_EMITTERS = 1 << 23
+"""Largest number of emitters, as entries of lists have 23 bits for them."""
 
 
 @dataclass(frozen=True)
 class VisibilityLightCache(Estimator):
-    """Direct light from emitters, of which each region samples those that it or a neighbour of it saw lately.
+    """Direct light from emitters; each region samples those that it or a neighbouring region saw lately.
 
-    Lights are selected by what they reflect at the very point: the closed-form cosine integral of their triangle, and
-    linearly transformed cosines for GGX; and by how often they are seen. With a share of samples another light is
-    explored. Where a region's points see more lights than its cache can hold, as under a wall of thousands of equal
-    ones, it learns that selecting by the hierarchy alone varies less, and does so. Unbiased. Every path vertex uses it.
+    A light is selected in proportion to the light that it would reflect at the very point, by the closed-form cosine
+    integral of its triangle and linearly transformed cosines for GGX, times the share of samples in which it was seen.
+    With some probability another light is explored. Where a region's points see more lights than its cache can hold,
+    as under a wall of thousands of equal ones, it learns that selecting by the hierarchy alone varies less, and does
+    so. Every path vertex uses the cache. Unbiased.
     """
 
     term: ClassVar[str] = "emitters"
 
     capacity: int = 32
-    """Lights a bucket at most, 1 to 32; more lights go to more buckets, of which a sample weighs one."""
+    """Largest number of lights in a bucket, 1 to 32. A region with more lights has more buckets, and each sample
+    weighs the lights of one bucket."""
     exploration: float = 0.1
-    """Share of samples that also explore, in (0, 1): the first one, and the only one unless ``adapts_exploration``; at
-    least 0.3 then in frames in which a light moves."""
+    """Probability in (0, 1) of exploring another light. With ``adapts_exploration`` it is only the initial value, which
+    is raised to 0.3 in frames where lights move."""
     adapts_exploration: bool = True
-    """Whether each region learns the share, from 0.05 to 0.75: by what exploring brings of what varies; and where only
-    to explore, without a sample of the cache, varies less than both together."""
+    """Whether each region learns that probability, from 0.05 to 0.75, by the part that explored lights have in the
+    second moment of its samples; and explores only, without samples of the cache, where that varies less."""
     memory: int = 8
-    """Frames that a light stays in a region after it was last seen, 0 to 200."""
-    explores_by: str = "hierarchy"
-    """How lights are explored: by the "hierarchy" over all of them, or by a "table" of the three weights below, as in
-    the paper, the same at every point."""
+    """Number of frames that a light stays in a region after it was last seen, 0 to 200."""
+    explores_by: Literal["hierarchy", "table"] = "hierarchy"
+    """How a light to explore is drawn: by the "hierarchy" over all lights, or from a "table" made of the three weights
+    below, as in the paper, the same at every point."""
     energy: float = 1.0
-    """Weight of a light's power in exploration by the table."""
+    """Weight of a light's power in the table."""
     change: float = 1.0
-    """Weight in the table of how far a light moved, times its power."""
+    """Weight in the table of the distance that a light moved since the last frame, times its power."""
     distance: float = 1.0
     """Weight in the table of a light's nearness to the camera."""
     samples: int = 2048
-    """Samples a region that are looked at, each frame."""
+    """Largest number of samples that a region learns from in a frame."""
 
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
@@ -85,12 +91,12 @@ class VisibilityLightCache(Estimator):
 
     @property
     def services(self) -> tuple[Service, ...]:
-        """Regions, and samples in them."""
+        """The octree of regions, which also sorts a frame's samples by region."""
         return (SampleOctree(),)
 
     @property
     def saves_state(self) -> bool:
-        """The caches hold all that frames before left."""
+        """True: the caches hold all that earlier frames left."""
         return True
 
     def bake_key(self, scene: Scene | BakedScene) -> str:
@@ -101,25 +107,25 @@ class VisibilityLightCache(Estimator):
         self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0
     ) -> CacheState | None:
         """Return empty caches for the eight leaves of the first octree."""
-        if scene.emitter_count == 0:
-            return None
         if scene.emitter_count > MOST_EMITTERS:
             raise OptionError(
                 f"VisibilityLightCache takes up to {MOST_EMITTERS:,} emitters, {scene.name} has "
                 f"{scene.emitter_count:,}; use LightHierarchy"
             )
-        device = launch.get_device(device)
-        tree = first_tree(scene, device)
-        places, areas = _places(scene.placed_emitters(device))
+        scene, target = whole_scene(scene), launch.get_device(device)
+        tree = first_tree(scene, target)
+        if tree is None:
+            return None
+        places, areas = _places(scene.placed_emitters(target))
         radiances = scene.emitter_powers() / (np.pi * np.maximum(areas, 1e-30)) * (areas > 0)
-        luminances = launch.on_device(radiances.astype(np.float32), wp.float32, device)
-        return CacheState(self._tables(8, device), _lists(8, device), places, tree, luminances)
+        luminances = launch.on_device(radiances.astype(np.float32), wp.float32, target)
+        return CacheState(self._tables(8, target), _lists(8, target), places, tree, luminances)
 
     def preprocess(self, frame: Frame, state: CacheState | None) -> CacheState | None:
-        """Bring the shapes of lights and the table of exploration up to the frame, and give paths the cache."""
+        """Return the state with the shapes and tree of this frame's lights, and let paths sample from the cache."""
         if state is None:
             return None
-        scene, device = frame.scene, frame.device
+        scene, device = whole_scene(frame.scene), frame.device
         emitters = frame.data.emitters
         moved = np.zeros(scene.emitter_count)
         if state.shapes is None or scene.is_animated:
@@ -128,7 +134,7 @@ class VisibilityLightCache(Estimator):
             shapes = wp.empty(len(places), dtype=light_cache_native.LightShape, device=device)
             frame.launch(light_cache.shape_lights, [frame.data, state.luminances, shapes], len(places))
             state = replace(state, places=places, shapes=shapes, emitters=emitters.emitters)
-        if moved.any() and self.adapts_exploration:  # what is known is in doubt
+        if moved.any() and self.adapts_exploration:  # the cached lights may be the wrong ones
             tables = launch.copied(state.tables, light_cache.CacheTables)
             least = min(max(self.exploration, MOVING_EXPLORATION), MOST_EXPLORATION)
             shares = np.maximum(tables.exploration.numpy(), np.float32(least))
@@ -142,12 +148,12 @@ class VisibilityLightCache(Estimator):
             state = replace(state, tree=moved_tree(frame, state.tree))
             cache.explores_by_tree, cache.tree = 1, state.tree.data
         else:
-            table = AliasTable.build(self._table(frame, moved, state.places[:, :3])).on(device)
+            table = AliasTable.build(self._table(scene, frame.camera, moved, state.places[:, :3])).on(device)
         frame.paths.use_lights(light_cache.CACHED_LIGHTS, cache, table)
         return state
 
     def _tables(self, leaves: int, device: wp.Device) -> light_cache.CacheTables:
-        """Return tables of regions that know nothing."""
+        """Return tables of so many regions that know no light."""
         tables = light_cache.CacheTables()
         for name in ("buckets", "offsets"):
             setattr(tables, name, wp.zeros(leaves, dtype=wp.int32, device=device))
@@ -160,11 +166,18 @@ class VisibilityLightCache(Estimator):
         tables.excesses = wp.zeros(leaves, dtype=wp.float32, device=device)
         return tables
 
-    def _table(self, frame: Frame, moved: np.ndarray, centers: np.ndarray) -> np.ndarray:
-        """Return the relative probabilities of exploring each light (section 4.3)."""
-        powers = frame.scene.emitter_powers()
-        away = np.linalg.norm(centers - np.asarray(frame.camera.position, np.float64), axis=1)
-        near = 1.0 / (away**2 + (0.02 * frame.scene.radius) ** 2)
+    def _table(self, scene: Scene, camera: Camera, moved: np.ndarray, centers: np.ndarray) -> np.ndarray:
+        """Return the relative probability of exploring each light, float64 [emitter] (section 4.3).
+
+        Args:
+            scene: Scene of the lights.
+            camera: Camera of the frame.
+            moved: float64 [emitter], distance since the last frame in metres.
+            centers: float64 [emitter, 3], metres.
+        """
+        powers = scene.emitter_powers()
+        away = np.linalg.norm(centers - np.asarray(camera.position, np.float64), axis=1)
+        near = 1.0 / (away**2 + (0.02 * scene.radius) ** 2)
         weights = np.zeros(len(powers))
         for share, part in ((self.energy, powers), (self.change, powers * moved), (self.distance, near * (powers > 0))):
             if part.sum() > 0:
@@ -176,12 +189,12 @@ class VisibilityLightCache(Estimator):
         frame.paths.want(self.term)
 
     def after(self, frame: Frame, state: CacheState | None) -> CacheState | None:
-        """Learn from the samples of the frame, if any were kept."""
+        """Return caches that learnt from the samples of the frame, if any were kept."""
         lesson = frame.offered(Lesson)
         return state if lesson is None else self.learn(lesson, state)
 
     def learn(self, lesson: Lesson, state: CacheState | None) -> CacheState | None:
-        """Make the caches of the next frame from the samples of this one."""
+        """Return the caches of the next frame, made from the samples of this one."""
         if state is None:
             return None
         device, leaves = lesson.device, lesson.octree.leaf_count
@@ -230,24 +243,26 @@ class VisibilityLightCache(Estimator):
 
 @dataclass
 class CacheState:
-    """The caches of all regions, and where lights were."""
+    """The caches of all regions, and the places of lights. No call changes a state; each returns a new one."""
 
     tables: light_cache.CacheTables
+    """Lights of every region in buckets, and the probabilities with which they are sampled."""
     known: light_cache_build.LightLists
-    """Every region's lights with the frames since they were seen, of which the tables are made."""
+    """Lights of every region with the number of frames since each was seen, from which the tables are made."""
     places: np.ndarray
-    """float64 [emitter, 6] where each was in the last frame, and how it was turned."""
+    """float64 [emitter, 6]: position of each emitter in the last frame in metres, and its direction or first corner."""
     tree: TreeState = field(metadata={"derived": True})
-    """For exploration."""
+    """Hierarchy over all lights, by which others are explored."""
     luminances: wp.array = field(metadata={"derived": True})
-    """float32 [emitter] of the mean radiance of emissive triangles, 0 of others."""
+    """float32 [emitter]: luminance of the mean radiance of emissive triangles, W/(m^2 sr); 0 for other lights."""
     shapes: wp.array | None = field(default=None, metadata={"derived": True})
-    """LightShape [emitter]; None before the first frame."""
+    """LightShape [emitter]: lights of this frame as the cache weighs them; None before the first frame."""
     emitters: wp.array | None = field(default=None, metadata={"derived": True})
-    """Emitter [emitter] of the scene; None before the first frame."""
+    """Emitter [emitter]: lights of the scene in this frame; None before the first frame."""
 
 
 def _lists(leaves: int, device: wp.Device) -> light_cache_build.LightLists:
+    """Return empty lists of lights for so many regions."""
     lists = light_cache_build.LightLists()
     lists.offsets = wp.zeros(leaves, dtype=wp.int32, device=device)
     lists.counts = wp.zeros(leaves, dtype=wp.int32, device=device)
@@ -257,7 +272,11 @@ def _lists(leaves: int, device: wp.Device) -> light_cache_build.LightLists:
 
 
 def _places(placed: PlacedEmitters) -> tuple[np.ndarray, np.ndarray]:
-    """Return centre and turn of each emitter, float64 [n, 6], and the area of its emitting sides, 0 without size."""
+    """Return the places of emitters, float64 [emitter, 6], and the areas of their emitting sides, float64 [emitter].
+
+    A place is the centre [m] with the direction, of a triangle with its first corner [m]. Lights without size have
+    area 0.
+    """
     places = np.concatenate([placed.table["position"], placed.table["direction"]], axis=1).astype(np.float64)
     areas = np.zeros(len(places))
     points = placed.corners

@@ -1,11 +1,10 @@
-"""What techniques that learn from samples know, as pictures: the octree's leaves, lights, shares, and a quadtree."""
+"""Pictures of what is learnt from samples: the octree's leaves, cached lights, shares of samples, and a quadtree."""
 
 from __future__ import annotations
 
 import math
 from numbers import Integral
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -15,7 +14,10 @@ from warp_gi.errors import OptionError
 from warp_gi.frame import Frame
 from warp_gi.kernels import reuse_pictures as kernels
 from warp_gi.kernels import types
+from warp_gi.kernels.light_cache import CacheTables
+from warp_gi.kernels.octree import Octree
 from warp_gi.paths import sky_probability
+from warp_gi.scene.baked import whole_scene
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.pinhole import camera_data
 from warp_gi.scheduler import FrameScheduler
@@ -25,16 +27,17 @@ from warp_gi.techniques.light_field.state import low_directions
 from warp_gi.techniques.paths.estimators import TracedEnvironment
 from warp_gi.techniques.reuse.guided_paths import GuidedPaths
 from warp_gi.techniques.reuse.light_cache import VisibilityLightCache
+from warp_gi.techniques.reuse.sample_octree import OctreeState
 from warp_gi.techniques.shared.legends import round_above, scale_bar, stacked, with_keys
 
 MAP_TEXELS = 64
-"""Along a side of the map of the light that comes to a point."""
+"""Texels along a side of the map of the light that comes to a point."""
 MAP_RAYS = 128
-"""Of a texel of that map."""
+"""Rays a texel of that map."""
 MAP_PIXELS = 512
-"""Along a side of the maps in the picture."""
+"""Pixels along a side of each map in the picture."""
 LEAST_DENSITY = 1e-3
-"""1/sr, where the scale of densities begins; the largest leaf of a quadtree of 128 bits has 0.002 at least."""
+"""Density where the scale begins, 1/sr; the largest leaf of a quadtree of 128 bits has at least 0.002."""
 NOTHING_COLOR = (255, 255, 255)
 BORDER_COLOR = (0, 130, 130)  # dark turquoise, which magma does not have
 SHADE = np.array([0.37, 0.84, 0.40])
@@ -45,21 +48,21 @@ GAP = 8  # pixels between two maps
 def reuse_pictures(
     scheduler: FrameScheduler, frame: Frame, folder: str | Path, pixel: tuple[int, int] | None = None
 ) -> list[Path]:
-    """Write what is known after a frame as PNG files, those that the pipeline's techniques have; return the paths.
+    """Write pictures of what the pipeline has learnt after a frame, as PNG files; return the paths.
 
     Pixels show the surface in their middle. leaves.png: each leaf of the octree in a colour of its own. samples.png:
-    samples of the frame in the leaf. With a VisibilityLightCache, lights.png: lights in the leaf's cache, and
-    exploration.png: share of its samples that explore. With GuidedPaths, bsdf_share.png: share of directions by the
-    BSDF, of rough surfaces; and with a pixel quadtree.png: octahedral maps of the light that comes to the point there,
-    path traced, and of the density of its leaf's quadtree (temporal_reuse.txt, Fig. 10).
+    number of the frame's samples in the leaf. With a VisibilityLightCache, lights.png: number of lights in the leaf's
+    cache, and exploration.png: share of its samples that explore. With GuidedPaths, bsdf_share.png: share of directions
+    by the BSDF, for rough surfaces; and with a pixel quadtree.png: octahedral maps of the light that comes to the point
+    there, path traced, and of the density of its leaf's quadtree (temporal_reuse.txt, Fig. 10).
 
     Args:
-        scheduler: What rendered the frame, and no frame since.
-        frame: Its last one.
+        scheduler: Scheduler that rendered the frame, and no frame since.
+        frame: Last frame of the scheduler.
         folder: Where pictures go; made if missing.
         pixel: Column and row, (0, 0) at the top left.
 
-    Raises OptionError for a pipeline that learns nothing, a pixel outside of the picture or without a surface.
+    Raises OptionError for a pipeline that learns nothing, or for a pixel outside of the picture or without a surface.
     """
     with scheduler.scene.lock:
         check_pictures(scheduler, frame.camera, pixel)
@@ -98,7 +101,7 @@ def _pictures(scheduler: FrameScheduler, frame: Frame, pixel: tuple[int, int] | 
 def check_pictures(scheduler: FrameScheduler, camera: Camera, pixel: tuple[int, int] | None = None) -> None:
     """Raise OptionError where ``reuse_pictures`` would, as far as that is known before the frame.
 
-    Whether the pixel has a surface is known where nothing moves.
+    In a scene where nothing moves, that includes a pixel without a surface.
     """
     pipeline = scheduler.pipeline
     if "octree" not in pipeline.services():
@@ -108,9 +111,7 @@ def check_pictures(scheduler: FrameScheduler, camera: Camera, pixel: tuple[int, 
         )
     if pixel is None:
         return
-    if not isinstance(pipeline.indirect, GuidedPaths):
-        name = type(pipeline.indirect).__name__
-        raise OptionError(f"the picture of a pixel's quadtree needs GuidedPaths for the indirect light, not {name}")
+    _guided_paths(scheduler)
     width, height = camera.resolution
     column, row = pixel
     if not (isinstance(column, Integral) and isinstance(row, Integral)):
@@ -123,7 +124,16 @@ def check_pictures(scheduler: FrameScheduler, camera: Camera, pixel: tuple[int, 
         _check_surface(_view(data, camera, cube, scheduler.device, pixel).leaves.numpy()[0], pixel)
 
 
-def cached_lights(tables: Any) -> np.ndarray:
+def _guided_paths(scheduler: FrameScheduler) -> GuidedPaths:
+    """Return the estimator whose quadtrees are shown; raises OptionError for another one."""
+    indirect = scheduler.pipeline.indirect
+    if not isinstance(indirect, GuidedPaths):
+        name = type(indirect).__name__
+        raise OptionError(f"the picture of a pixel's quadtree needs GuidedPaths for the indirect light, not {name}")
+    return indirect
+
+
+def cached_lights(tables: CacheTables) -> np.ndarray:
     """Return how many lights are in the cache of each leaf, int32 [leaf]."""
     buckets, offsets, items = (getattr(tables, name).numpy() for name in ("buckets", "offsets", "items"))
     counts = np.zeros(len(buckets), np.int32)
@@ -136,9 +146,9 @@ def cached_lights(tables: Any) -> np.ndarray:
 
 
 def _view(
-    data: types.SceneData, camera: Camera, octree: Any, device: wp.Device, pixel: tuple[int, int] | None = None
+    data: types.SceneData, camera: Camera, octree: Octree, device: wp.Device, pixel: tuple[int, int] | None = None
 ) -> kernels.LeafView:
-    """Return what the middles of all pixels see, or that of one."""
+    """Return leaf, point and normal of the surface in the middle of every pixel, or of one."""
     width, height = camera.resolution
     begin, count = (0, width * height) if pixel is None else (pixel[1] * width + pixel[0], 1)
     view = kernels.LeafView()
@@ -149,6 +159,7 @@ def _view(
 
 
 def _check_surface(leaf: int, pixel: tuple[int, int]) -> None:
+    """Raise OptionError for a pixel that sees no leaf, -1."""
     if leaf < 0:
         raise OptionError(f"pixel ({pixel[0]}, {pixel[1]}) sees no surface, so it is in no region; choose another")
 
@@ -156,8 +167,8 @@ def _check_surface(leaf: int, pixel: tuple[int, int]) -> None:
 # ---- values on surfaces ----
 
 
-def _draw_leaves(leaves: np.ndarray, normals: np.ndarray, state: Any, index: int) -> np.ndarray:
-    """Return the picture of which leaf is where, a little shaded."""
+def _draw_leaves(leaves: np.ndarray, normals: np.ndarray, state: OctreeState, index: int) -> np.ndarray:
+    """Return a picture of the leaves, each in its colour, a little shaded."""
     masks = state.octree.nodes.numpy() & 255
     is_leaf = (masks[:, None] >> np.arange(8, dtype=np.uint32) & 1).astype(bool).ravel()
     seen, where = np.unique(leaves, return_inverse=True)
@@ -176,7 +187,7 @@ def _draw_counts(leaves: np.ndarray, counts: np.ndarray, title: str) -> np.ndarr
 
 
 def _about(leaves: np.ndarray, values: np.ndarray, title: str) -> str:
-    """Return the title with the range of what is in view."""
+    """Return the title with the range of the values of leaves in view."""
     seen = values[np.unique(leaves[leaves >= 0])]
     return f"{title}: {seen.min():.4g} to {seen.max():.4g} in view" if seen.size else title
 
@@ -188,7 +199,7 @@ def _draw_values(leaves: np.ndarray, values: np.ndarray, top: float, title: str)
 
 
 def _with_nothing(image: np.ndarray, leaves: np.ndarray, title: str = "") -> np.ndarray:
-    """Return the picture of leaves with pixels that see none in a colour of their own, which a legend names."""
+    """Return a picture of leaves in which pixels without a leaf have a colour of their own, with a legend for it."""
     image = np.where(leaves[..., None] < 0, np.array(NOTHING_COLOR, np.uint8), image)
     keys = ((NOTHING_COLOR, "no surface"),) if (leaves < 0).any() else ()
     return with_keys(image, keys, title) if keys or title else image
@@ -200,7 +211,7 @@ def _with_nothing(image: np.ndarray, leaves: np.ndarray, title: str = "") -> np.
 def _draw_quadtree(
     scheduler: FrameScheduler, frame: Frame, view: kernels.LeafView, pixel: tuple[int, int]
 ) -> np.ndarray:
-    """Return octahedral maps of the light that comes to a pixel's point and of what its leaf expects, side by side."""
+    """Return octahedral maps side by side: of the light that comes to a pixel's point, and of its leaf's quadtree."""
     item = pixel[1] * frame.camera.resolution[0] + pixel[0]
     leaf = int(view.leaves.numpy()[item])
     _check_surface(leaf, pixel)
@@ -236,7 +247,7 @@ def _draw_quadtree(
 
 
 def _heat(densities: np.ndarray, top: float) -> np.ndarray:
-    """Return densities [1/sr] in the magma colours, on a logarithmic scale from LEAST_DENSITY to ``top``."""
+    """Return densities [1/sr] in the magma colours, on a logarithmic scale from ``LEAST_DENSITY`` to ``top``."""
     share = np.log(np.maximum(densities, LEAST_DENSITY) / LEAST_DENSITY) / math.log(top / LEAST_DENSITY)
     return magma(share.astype(np.float32))
 
@@ -244,10 +255,10 @@ def _heat(densities: np.ndarray, top: float) -> np.ndarray:
 def incident_light(scheduler: FrameScheduler, frame: Frame, origin: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Return the luminance [W/(m^2 sr)] that comes to a point, float64 [MAP_TEXELS, MAP_TEXELS], an octahedral map.
 
-    What emitters send straight there is left out, and what comes from below the surface of the ``normal``. The sky
-    counts if paths find it, not an estimator of another kind.
+    Light straight from emitters is left out, and light from below the surface of the ``normal``. Light from the sky is
+    in it if paths find the sky, and not another estimator.
     """
-    pipeline, scene = scheduler.pipeline, scheduler.scene
+    indirect, scene = _guided_paths(scheduler), whole_scene(scheduler.scene)
     data = launch.copied(frame.data, types.SceneData)
     data.emitters = launch.copied(data.emitters, types.Emitters)
     if scene.emitter_count:
@@ -255,22 +266,26 @@ def incident_light(scheduler: FrameScheduler, frame: Frame, origin: np.ndarray, 
     incident = kernels.IncidentMap()
     incident.origin, incident.normal = wp.vec3(*origin.tolist()), wp.vec3(*normal.tolist())
     incident.resolution, incident.rays, incident.seed = MAP_TEXELS, MAP_RAYS, frame.seed
-    incident.max_depth = pipeline.indirect.max_depth - 1
-    incident.roulette_depth = max(pipeline.indirect.roulette_depth - 1, 2)
+    incident.max_depth = indirect.max_depth - 1
+    incident.roulette_depth = max(indirect.roulette_depth - 1, 2)
     incident.sky_probability = sky_probability(scene)
-    incident.sees_sky = int(isinstance(pipeline.environment, TracedEnvironment))
+    incident.sees_sky = int(isinstance(scheduler.pipeline.environment, TracedEnvironment))
     incident.light = wp.empty(MAP_TEXELS**2, dtype=wp.float32, device=frame.device)
     launch.launch(kernels.map_incident_light, MAP_TEXELS**2, [data, incident], frame.device, 16)
     return incident.light.numpy().reshape(MAP_TEXELS, MAP_TEXELS).astype(np.float64)
 
 
 def quadtree_densities(scheduler: FrameScheduler, leaf: int, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the density [1/sr] of a leaf's quadtree at a position and its cells' nodes, [MAP_PIXELS, MAP_PIXELS]."""
+    """Return two octahedral maps [MAP_PIXELS, MAP_PIXELS] of a leaf's quadtree, as it is at a position [m].
+
+    They are its density [1/sr], float32, and the node of its cell in each direction, int32.
+    """
     guides = scheduler.state("indirect").guides
     tree, anchor = guides.trees.numpy()[leaf], guides.anchors.numpy()[leaf]
     densities = wp.empty(MAP_PIXELS**2, dtype=wp.float32, device=scheduler.device)
     nodes = wp.empty(MAP_PIXELS**2, dtype=wp.int32, device=scheduler.device)
-    settings = [wp.vec4ui(*tree.tolist()), scheduler.pipeline.indirect.bits]
+    settings: list[object] = [wp.vec4ui(*tree.tolist()), _guided_paths(scheduler).bits]
     settings += [wp.vec4(*anchor.tolist()), wp.vec3(*position.tolist()), MAP_PIXELS]
     launch.launch(kernels.map_quadtree, MAP_PIXELS**2, [*settings, densities, nodes], scheduler.device)
-    return tuple(values.numpy().reshape(MAP_PIXELS, MAP_PIXELS) for values in (densities, nodes))
+    shape = (MAP_PIXELS, MAP_PIXELS)
+    return densities.numpy().reshape(shape), nodes.numpy().reshape(shape)

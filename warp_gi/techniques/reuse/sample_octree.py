@@ -1,16 +1,18 @@
-"""The octree that techniques which learn from samples share, and the samples of a frame in it."""
+"""The octree of regions, which estimators that learn from samples share, and a frame's samples in it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import warp as wp
 
 from warp_gi import launch
 from warp_gi.errors import OptionError, check_whole
-from warp_gi.kernels import octree, samples
+from warp_gi.kernels import octree as octree_kernels
+from warp_gi.kernels import samples as sample_kernels
 from warp_gi.service import Service
 
 if TYPE_CHECKING:
@@ -21,17 +23,22 @@ if TYPE_CHECKING:
     from warp_gi.scene.scene import Scene
 
 MOST_SAMPLES = 1 << 28
-MOST_VERTICES = 7  # of a path whose samples are kept: each path has room for as many, so more would keep fewer paths
+"""Largest number of samples that settings may name."""
+MOST_VERTICES = 7
+"""Largest number of vertices of a path whose samples are kept. All paths have room for as many, so a larger number
+would keep samples of fewer paths."""
 SLICES_PER_THREAD = 4
-MOST_CELLS = 1 << 24  # offsets of inner nodes have 24 bits
+"""Slices a thread of launches over leaves."""
+MOST_CELLS = 1 << 24
+"""Number of inner cells from which on a tree is refused, as offsets of inner nodes have 24 bits."""
 
 
 @dataclass(frozen=True)
 class SampleOctree(Service):
     """An octree over the points where paths scatter, as fine as there are samples to learn from.
 
-    A cell is split where it holds more than ``split`` samples of a frame, by as many levels at once as that needs, and
-    given up where it holds fewer than ``collapse`` (temporal_reuse.txt, section 6).
+    A cell with more than ``split`` samples of a frame is split, by as many levels at once as that needs; the children
+    of a cell with fewer than ``collapse`` are given up (temporal_reuse.txt, section 6).
     """
 
     name: ClassVar[str] = "octree"
@@ -41,7 +48,8 @@ class SampleOctree(Service):
     collapse: int = 512
     """Samples of a frame below which an inner node becomes a leaf."""
     most_samples: int = 1 << 20
-    """Samples that are kept of a frame at most, 40 bytes each; of more paths, every second, third ... is recorded."""
+    """Largest number of samples of a frame that are kept, 40 bytes each; if there would be more, only every second,
+    third, ... path is recorded."""
 
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
@@ -52,7 +60,7 @@ class SampleOctree(Service):
 
     @property
     def saves_state(self) -> bool:
-        """The tree is all that frames before left."""
+        """True: the tree is all that earlier frames left."""
         return True
 
     def bake_key(self, scene: Scene | BakedScene) -> str:
@@ -62,34 +70,34 @@ class SampleOctree(Service):
     def start(
         self, scene: Scene | BakedScene, device: str | wp.Device, bake: Bake | None = None, seed: int = 0
     ) -> OctreeState:
-        """Return a tree whose root has eight leaves, over the cube around the scene's bounds in all of its time."""
+        """Return a tree whose root has eight leaves, over a cube around the scene's bounds at all times."""
         device = launch.get_device(str(device))
         low, high = (corner.astype(np.float64) for corner in scene.bounds)
         edge = max(float((high - low).max()), 1e-6) * 1.001
         corner = (low + high) / 2 - edge / 2
-        cube = octree.Octree()
+        cube = octree_kernels.Octree()
         cube.nodes = launch.on_device(np.array([255], np.uint32), wp.uint32, device)
-        cube.low, cube.scale = wp.vec3(*corner), octree.SIDE / edge
+        cube.low, cube.scale = wp.vec3(*corner), octree_kernels.SIDE / edge
         prefixes, levels = (wp.zeros(1, dtype=dtype, device=device) for dtype in (wp.uint32, wp.int32))
         return OctreeState(cube, prefixes, levels, wp.zeros(8, dtype=wp.int32, device=device))
 
     def preprocess(self, frame: Frame, state: OctreeState) -> OctreeState:
-        """Let samplers find regions in the tree, and leave samples for ``after``."""
-        frame.paths.use_regions(samples.SAMPLE_REGIONS, lambda paths: self._regions(frame, state, paths))
+        """Let samplers find their region in the tree, and record samples for ``after``; the state stays as it is."""
+        frame.paths.use_regions(sample_kernels.SAMPLE_REGIONS, lambda paths: self._regions(frame, state, paths))
         return state
 
-    def _regions(self, frame: Frame, state: OctreeState, paths: PathRequest) -> samples.SampleRegions:
+    def _regions(self, frame: Frame, state: OctreeState, paths: PathRequest) -> sample_kernels.SampleRegions:
         """Return the tree, and empty buffers for samples, as path kernels read them."""
         with frame.stage(f"preprocess {self.name}"):
-            regions = samples.SampleRegions()
+            regions = sample_kernels.SampleRegions()
             regions.octree, regions.moves = state.octree, int(frame.scene.is_animated)
             vertices = min(paths.max_depth - 1, MOST_VERTICES)
             regions.records = self.records(frame, vertices, state.spare.take())
         return regions
 
     def after(self, frame: Frame, state: OctreeState) -> OctreeState:
-        """Return the tree that fits the samples of the frame, and offer a ``Lesson``; nothing if none were kept."""
-        if frame.paths.regions.sampler is not samples.SAMPLE_REGIONS:
+        """Return the tree that fits the samples of the frame, and offer a ``Lesson``, if any samples were kept."""
+        if frame.paths.regions.sampler is not sample_kernels.SAMPLE_REGIONS:
             return state
         records = frame.paths.regions.data.records
         lesson = self.learn(state, records, frame.device)
@@ -97,14 +105,19 @@ class SampleOctree(Service):
         lesson.octree.spare.give(records)
         return lesson.octree
 
-    def records(self, frame: Frame, vertices: int, previous: samples.SampleRecords | None) -> samples.SampleRecords:
-        """Return empty buffers for the samples of a frame whose paths have ``vertices``; uses ``previous`` again."""
+    def records(
+        self, frame: Frame, vertices: int, previous: sample_kernels.SampleRecords | None
+    ) -> sample_kernels.SampleRecords:
+        """Return empty buffers for the samples of a frame whose paths have so many ``vertices``.
+
+        The arrays of ``previous`` are used again if they have the right size.
+        """
         paths = frame.tiled_items * frame.settings.spp
         stride = max(1, -(-paths * vertices // self.most_samples))
         slots = -(-paths // stride) * vertices
-        records = samples.SampleRecords()
+        records = sample_kernels.SampleRecords()
         if previous is not None and previous.codes.shape[0] == slots:
-            records = launch.copied(previous, samples.SampleRecords)
+            records = launch.copied(previous, sample_kernels.SampleRecords)
         else:
             for name in ("codes", "lights", "directions", "mixtures"):
                 setattr(records, name, wp.empty(slots, dtype=wp.uint32, device=frame.device))
@@ -114,27 +127,27 @@ class SampleOctree(Service):
         records.vertices, records.stride, records.seed = vertices, stride, frame.seed
         return records
 
-    def learn(self, state: OctreeState, records: samples.SampleRecords, device: wp.Device) -> Lesson:
-        """Return the tree that fits the samples of a frame, and these sorted by its leaves."""
+    def learn(self, state: OctreeState, records: sample_kernels.SampleRecords, device: wp.Device) -> Lesson:
+        """Return the tree that fits the samples of a frame, and the samples sorted by its leaves."""
         codes, slots = _listed(records, device)
         tree, count = self._build(state, codes, device)
         leaves = 8 * count
-        neighbours = wp.empty(leaves * octree.NEIGHBOURS, dtype=wp.int32, device=device)
+        neighbours = wp.empty(leaves * octree_kernels.NEIGHBOURS, dtype=wp.int32, device=device)
         origins = wp.empty(leaves, dtype=wp.int32, device=device)
-        launch.launch(octree.augment_leaves, leaves, [tree, neighbours], device)
+        launch.launch(octree_kernels.augment_leaves, leaves, [tree, neighbours], device)
         counts = wp.empty(leaves, dtype=wp.int32, device=device)
-        launch.launch(octree.find_origins, leaves, [tree, state.octree.nodes, codes, origins, counts], device)
-        cube = launch.copied(state.octree, octree.Octree)
+        launch.launch(octree_kernels.find_origins, leaves, [tree, state.octree.nodes, codes, origins, counts], device)
+        cube = launch.copied(state.octree, octree_kernels.Octree)
         cube.nodes = tree.nodes
-        grouped = samples.LeafSamples()
+        grouped = sample_kernels.LeafSamples()
         grouped.starts, grouped.counts, grouped.order = tree.starts, counts, slots
         grown = OctreeState(cube, tree.prefixes, tree.levels, tree.counts)
         return Lesson(grown, tree, records, grouped, neighbours, origins, device)
 
-    def _build(self, state: OctreeState, codes: wp.array, device: wp.Device) -> tuple[octree.OctreeNodes, int]:
-        """Return the nodes, level by level, and how many there are."""
-        most = 1 + octree.LEVELS * (codes.shape[0] // self.collapse)
-        tree = octree.OctreeNodes()
+    def _build(self, state: OctreeState, codes: wp.array, device: wp.Device) -> tuple[octree_kernels.OctreeNodes, int]:
+        """Return the nodes of the tree that fits samples with these ``codes``, level by level, and their number."""
+        most = 1 + octree_kernels.LEVELS * (codes.shape[0] // self.collapse)
+        tree = octree_kernels.OctreeNodes()
         for name in ("nodes", "prefixes"):
             setattr(tree, name, wp.zeros(most, dtype=wp.uint32, device=device))
         for name in ("levels", "previous", "inner"):
@@ -147,10 +160,10 @@ class SampleOctree(Service):
         while begin < end:
             level = end - begin
             inputs = [tree, old, codes, begin, self.split, self.collapse]
-            launch.launch(octree.mark_children, level, inputs, device)
+            launch.launch(octree_kernels.mark_children, level, inputs, device)
             inner = tree.inner[begin:end]
             wp.utils.array_scan(inner, inner, inclusive=True)
-            launch.launch(octree.place_children, level, [tree, old, begin, end], device)
+            launch.launch(octree_kernels.place_children, level, [tree, old, begin, end], device)
             begin, end = end, end + int(inner.numpy()[-1])
         if end >= MOST_CELLS:
             raise OptionError(
@@ -165,74 +178,81 @@ class SampleOctree(Service):
 class SpareRecords:
     """Buffers for samples that a frame is done with, for the next frame to use again.
 
-    A frame takes them from the state before, and leaves them in the state after. So a frame that is interrupted, whose
-    last launches may still write there, leaves none.
+    They are a cache of memory: what is in it changes no picture, so that states may share it, and a frame may empty
+    it. A frame takes the buffers from the state before, and leaves them in the state after. A frame that is
+    interrupted, whose last launches may still write there, so leaves none.
     """
 
     def __init__(self) -> None:
-        self.records: samples.SampleRecords | None = None
+        self.records: sample_kernels.SampleRecords | None = None
 
-    def take(self) -> samples.SampleRecords | None:
+    def take(self) -> sample_kernels.SampleRecords | None:
         """Return the buffers, if there are any, and keep them no more."""
         records, self.records = self.records, None
         return records
 
-    def give(self, records: samples.SampleRecords) -> None:
+    def give(self, records: sample_kernels.SampleRecords) -> None:
         """Keep buffers for the next frame."""
         self.records = records
 
 
 @dataclass
 class OctreeState:
-    """A tree, and what pictures show of it."""
+    """An octree, and what pictures show of it. No call changes a state but for ``spare``; each returns a new one."""
 
-    octree: octree.Octree
+    octree: octree_kernels.Octree
+    """Nodes and cube of the tree as kernels read them."""
     prefixes: wp.array
-    """uint32 [node] lowest code of its cell."""
+    """uint32 [node]: lowest code of a point in the node's cell."""
     levels: wp.array
-    """int32 [node] 0 is the root's."""
+    """int32 [node]: level of the node's cell; the root has 0."""
     counts: wp.array
-    """int32 [8 node + octant] samples in the cell in the last frame."""
+    """int32 [8 * node + octant]: number of samples of the last frame in each child's cell."""
     spare: SpareRecords = field(default_factory=SpareRecords, metadata={"derived": True})
+    """Buffers for the next frame's samples, if the last frame left any."""
 
     @property
     def leaf_count(self) -> int:
-        """Places for leaves: eight a node, those of inner children included."""
+        """Number of places for leaves: eight a node, those of children that are inner nodes included."""
         return 8 * self.octree.nodes.shape[0]
 
 
 @dataclass
 class Lesson:
-    """What a frame's samples have to teach: they, sorted by the leaves of the tree that fits them."""
+    """A frame's samples, sorted by the leaves of the tree that fits them, for estimators to learn from."""
 
     octree: OctreeState
-    tree: octree.OctreeNodes
-    records: samples.SampleRecords
-    samples: samples.LeafSamples
-    """``most`` is for each technique to set."""
+    """State of the tree that fits the samples."""
+    tree: octree_kernels.OctreeNodes
+    """Nodes of that tree with all that building it found."""
+    records: sample_kernels.SampleRecords
+    """The samples, in the order of paths and vertices."""
+    samples: sample_kernels.LeafSamples
+    """Which samples lie in which leaf; ``leaf_samples`` sets how many of them are looked at."""
     neighbours: wp.array
-    """int32 [6 leaf + face]"""
+    """int32 [6 * leaf + face]: leaf or node beyond each face of a leaf."""
     origins: wp.array
-    """int32 [leaf] whose knowledge it takes over; -1: the place holds no leaf."""
+    """int32 [leaf]: leaf of the last tree whose knowledge a leaf takes over; -1 where the place holds no leaf."""
     device: wp.Device
+    """Device of all arrays."""
 
-    def launch(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
-        """Run a kernel over all leaves, in few slices: kernels are many, and a slice costs tens of microseconds."""
+    def launch(self, kernel: wp.Kernel, inputs: Sequence[object]) -> None:
+        """Run a kernel over all leaves, in few slices: kernels are many, and each slice costs tens of microseconds."""
         leaves = self.octree.leaf_count
         smallest_slice = max(16, -(-leaves // (SLICES_PER_THREAD * launch.thread_count())))
         launch.launch(kernel, leaves, inputs, self.device, smallest_slice)
 
-    def leaf_samples(self, most: int) -> samples.LeafSamples:
-        """Return the samples by leaf, of which ``most`` are looked at in one."""
-        grouped = launch.copied(self.samples, samples.LeafSamples)
+    def leaf_samples(self, most: int) -> sample_kernels.LeafSamples:
+        """Return the samples by leaf, of which kernels look at up to ``most`` in each leaf."""
+        grouped = launch.copied(self.samples, sample_kernels.LeafSamples)
         grouped.most = most
         return grouped
 
 
 def running_sums(counts: wp.array) -> tuple[wp.array, int]:
-    """Return where each item begins if ``counts`` [int32] of them stand one after another, and the sum.
+    """Return where each run begins if runs of ``counts`` items stand one after another, and the sum of ``counts``.
 
-    Raises OptionError where that is beyond what 32 bits count.
+    Both arrays are int32 [run]. Raises OptionError for a sum beyond what 32 bits count.
     """
     if counts.shape[0] > MOST_SAMPLES // 1024 and int(counts.numpy().sum(dtype=np.int64)) >= 1 << 31:
         raise OptionError(f"{counts.shape[0]:,} leaves know too many lights together; raise octree.split")
@@ -242,17 +262,17 @@ def running_sums(counts: wp.array) -> tuple[wp.array, int]:
     return offsets, int(offsets[last].numpy()[0] + counts[last].numpy()[0])
 
 
-def _listed(records: samples.SampleRecords, device: wp.Device) -> tuple[wp.array, wp.array]:
+def _listed(records: sample_kernels.SampleRecords, device: wp.Device) -> tuple[wp.array, wp.array]:
     """Return the codes of all samples in rising order, and their slots."""
-    chunks = -(-records.codes.shape[0] // samples.CHUNK)
+    chunks = -(-records.codes.shape[0] // sample_kernels.CHUNK)
     ends = wp.empty(chunks, dtype=wp.int32, device=device)
-    launch.launch(samples.count_samples, chunks, [records, ends], device, 16)
+    launch.launch(sample_kernels.count_samples, chunks, [records, ends], device, 16)
     wp.utils.array_scan(ends, ends, inclusive=True)
     count = int(ends[chunks - 1 : chunks].numpy()[0])
     codes = wp.empty(2 * count, dtype=wp.int32, device=device)  # sorting needs as much again
     slots = wp.empty(2 * count, dtype=wp.int32, device=device)
     if count == 0:
         return codes, slots
-    launch.launch(samples.list_samples, chunks, [records, ends, codes, slots], device, 16)
+    launch.launch(sample_kernels.list_samples, chunks, [records, ends, codes, slots], device, 16)
     wp.utils.radix_sort_pairs(codes, slots, count)
     return codes[:count], slots[:count]

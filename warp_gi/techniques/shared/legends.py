@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from warp_gi.sequence.preview import magma
 
-_LINE = 26  # pixels
+if TYPE_CHECKING:
+    from PIL.ImageFont import FreeTypeFont, ImageFont
+
+Color = tuple[int, int, int]
+"""Red, green and blue in sRGB, 0 to 255."""
+_LINE = 26  # pixels from a line of text to the next
 
 
-def label_font(size: int = 16) -> Any:
+def label_font(size: int = 16) -> FreeTypeFont | ImageFont:
     """Return the font of legends, ``size`` pixels high."""
     from PIL import ImageFont
 
@@ -22,12 +28,12 @@ def label_font(size: int = 16) -> Any:
         return ImageFont.load_default()
 
 
-def with_keys(image: np.ndarray, keys: tuple[tuple[tuple[int, int, int], str], ...], title: str = "") -> np.ndarray:
-    """Return the image with lines below it that name its colours."""
+def with_keys(image: np.ndarray, keys: Sequence[tuple[Color, str]], title: str = "") -> np.ndarray:
+    """Return the image with a legend below it: a box of each colour with its meaning, then the title."""
     from PIL import Image, ImageDraw
 
     font = label_font()
-    rows: list[list[tuple[Any, str, int]]] = [[]]
+    rows: list[list[tuple[Color, str, int]]] = [[]]
     width, at = max(image.shape[1], 360), 8
     for color, text in keys:
         needed = 22 + math.ceil(font.getlength(text)) + 18
@@ -74,7 +80,8 @@ def scale_bar(width: int, top: float, title: str) -> np.ndarray:
     return np.asarray(bar)
 
 
-def _wrapped(text: str, font: Any, width: int) -> list[str]:
+def _wrapped(text: str, font: FreeTypeFont | ImageFont, width: int) -> list[str]:
+    """Return a text as lines of at most ``width`` pixels."""
     lines: list[str] = []
     for word in text.split():
         if lines and font.getlength(f"{lines[-1]} {word}") <= width:
@@ -85,20 +92,20 @@ def _wrapped(text: str, font: Any, width: int) -> list[str]:
 
 
 def stacked(image: np.ndarray, legend: np.ndarray) -> np.ndarray:
-    """Return the image above its legend, both on white, as wide as the wider."""
+    """Return an image above its legend, the narrower of the two widened with white."""
     width = max(image.shape[1], legend.shape[1])
     parts = [np.pad(p, ((0, 0), (0, width - p.shape[1]), (0, 0)), constant_values=255) for p in (image, legend)]
     return np.concatenate(parts)
 
 
 def round_above(value: float) -> float:
-    """Return 1, 2 or 5 times a power of ten, the next at or above ``value``."""
+    """Return the smallest number of the form 1, 2 or 5 times a power of ten that is at least ``value``."""
     power = 10.0 ** math.floor(math.log10(value))
     return next((step * power for step in (1, 2, 5) if step * power >= value), 10 * power)
 
 
 def exposure_of(image: np.ndarray) -> float:
-    """Return stops that bring the mean of what is lit to about 0.3: sky light alone may be dim indoors."""
+    """Return the exposure, in stops, that brings the mean of lit pixels to about 0.3, as the sky alone may be dim."""
     light = image.mean(-1)
     lit = light[light > 0]
     return 0.0 if not lit.size else float(np.clip(math.log2(0.3 / float(lit.mean())), -4, 8))

@@ -9,7 +9,7 @@ def encode(directions: np.ndarray) -> np.ndarray:
     """Return coordinates in [0, 1], float [..., 2], of directions [..., 3] of any length above zero."""
     x, y, z = np.moveaxis(0.5 * directions / np.abs(directions).sum(-1, keepdims=True), -1, 0)
     folded = ((0.5 - np.abs(z)) * np.where(x < 0, -1, 1), (0.5 - np.abs(x)) * np.where(z < 0, -1, 1))
-    return np.stack(np.where(y < 0, folded, (x, z)), axis=-1) + 0.5
+    return np.stack(list(np.where(y < 0, folded, (x, z))), axis=-1) + 0.5
 
 
 def unfolded(coordinates: np.ndarray) -> np.ndarray:
@@ -34,9 +34,10 @@ def texels_of(directions: np.ndarray, resolution: int) -> tuple[np.ndarray, np.n
 
 
 def wrapped_texels(columns: np.ndarray, rows: np.ndarray, resolution: int) -> np.ndarray:
-    """Return the texels, row by row, int [...], at ``columns`` and ``rows`` [...] up to ``resolution`` past an edge.
+    """Return the indices of texels, row by row, int [...], at ``columns`` and ``rows`` that may lie past an edge.
 
-    Whoever leaves the square over an edge comes back over the same one, as far from its middle on the other side.
+    They lie up to ``resolution`` past it. On the sphere, what leaves the square over an edge comes back over the same
+    edge, as far from its middle on the other side.
     """
 
     def reflected(at: np.ndarray) -> np.ndarray:

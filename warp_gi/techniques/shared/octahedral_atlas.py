@@ -12,8 +12,9 @@ from warp_gi.errors import one_line
 from warp_gi.techniques.shared.octahedral import wrapped_texels
 
 PADDING = 1
+"""Texels around each map that repeat what lies across its edge."""
 GPU_TEXELS = 16384
-"""Along a side of a texture; what graphics hardware takes."""
+"""Largest number of texels along a side of a texture that graphics hardware takes."""
 
 MAPPING = (
     "Octahedral, seen from above: +y in the middle, -y in the corners, +x towards higher columns, +z towards higher "
@@ -25,7 +26,7 @@ PADDING_TEXT = "One texel around each map repeats what lies across its edge on t
 
 
 def padded_texels(resolution: int) -> np.ndarray:
-    """Return int64 [resolution + 2, resolution + 2]: the texel, row by row, that each texel of a padded map repeats."""
+    """Return the index of the texel that each texel of a padded map repeats, int64 [resolution + 2, resolution + 2]."""
     at = np.arange(-PADDING, resolution + PADDING)
     return wrapped_texels(*np.meshgrid(at, at), resolution)
 
@@ -54,11 +55,11 @@ def write_parts(
     """Write ``pixels(0)``, ``pixels(1)`` ... as the parts of an EXR file, one for each of ``names``.
 
     Args:
-        part: The file to write to.
-        path: What errors call it.
-        pixels: Return float16 or float32 [height, width, channel], all alike.
-        channels: Their names.
-        names: Of the parts; "" for none.
+        part: File that is written.
+        path: Path that errors name.
+        pixels: Returns the pixels of a part by its index, float16 or float32 [height, width, channel], all alike.
+        channels: Names of the channels.
+        names: Names of the parts; "" is no name.
 
     Raises OSError.
     """
@@ -76,6 +77,8 @@ def write_parts(
             spec.attribute("oiio:subimagename", name)
         specs.append(spec)
     output = oiio.ImageOutput.create("exr")
+    if output is None:
+        raise OSError(f"cannot write {path}: this OpenImageIO writes no EXR files; install one that does")
     done = output.open(str(part), tuple(specs)) if len(specs) > 1 else output.open(str(part), specs[0])
     for index, spec in enumerate(specs):
         if index:

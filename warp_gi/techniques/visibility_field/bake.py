@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -17,24 +16,28 @@ from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_bake as bake_kernels
 from warp_gi.scene.geometry import surface_area
 from warp_gi.techniques.shared.octahedral import wrapped_texels
+from warp_gi.techniques.visibility_field.settings import MaskSettings
 
 DEFAULT_CELLS = 77
-"""Cells along the scene's longest axis where no cell size is given; the paper's Sponza (50 cm)."""
+"""Cells along the scene's longest axis where no cell size is given, as in the paper's Sponza (50 cm)."""
 MOST_CELLS = 1 << 27
-"""Of the grid, empty ones included: four bytes each."""
+"""Largest number of cells of a grid, empty ones included; each takes four bytes."""
 CHUNK_SAMPLES = 32
+"""Surface samples whose rays one thread of ``bake_masks`` traces."""
 ROUND_ENDS = (64, 192, 1 << 30)
-"""Samples of a cell after each round. What is settled by then is not traced in the next."""
+"""Samples of a cell after each round. Texels that are settled by then are not traced in the next round."""
 BATCH_BYTES = 1 << 24
-"""Of the masks of chunks that are held at a time."""
+"""Bytes of the masks of chunks that are held at a time."""
 HINTS = 1 << 18
+"""Entries of the table of triangles that blocked rays, which are tried first; on the CPU only."""
 BAKE_SETS = 16
+"""Sets of directions that surface samples draw from."""
 SAMPLES_A_CELL = 256
 """Samples on one side of as much surface as a face of a cell has, where their number is not given."""
 LEAST_SAMPLES, MOST_SAMPLES = 32, 8192
-"""Samples by area in a cell."""
+"""Least and largest number of samples by area in a cell."""
 MOST_EDGE_SAMPLES = 64
-"""Of one piece."""
+"""Largest number of samples on the edges of one piece."""
 EDGE_SPACINGS = 4.0
 """Extra samples lie this many mean sample distances apart on edges longer than that."""
 
@@ -46,6 +49,7 @@ class Grid:
     low: np.ndarray
     """float64 [3], metres: the lowest corner."""
     cell_size: float
+    """Edge of a cell, metres."""
     shape: tuple[int, int, int]
     """Cells along x, y, z."""
 
@@ -72,7 +76,8 @@ def grid_of(bounds: np.ndarray, cell_size: float) -> Grid:
             f"cell_size {size:g} m makes a grid of {np.prod(counts):.3g} cells over this scene, at most {MOST_CELLS:,} "
             f"are supported; use {least * 1.01:.3g} m or more"
         )
-    return Grid(low - margin, size, tuple(int(n) for n in counts))
+    nx, ny, nz = (int(n) for n in counts)
+    return Grid(low - margin, size, (nx, ny, nz))
 
 
 def _cell_counts(extent: np.ndarray, size: float) -> np.ndarray:
@@ -80,8 +85,10 @@ def _cell_counts(extent: np.ndarray, size: float) -> np.ndarray:
     return np.floor(np.minimum(extent, 1e100 * size) / size + 0.02) + 1
 
 
-def field_query(device: wp.Device, set_size: int, set_count: int, seed: int, hints: int = 0) -> Any:
-    """Return the struct that goes with a grid into every kernel: sets of directions, hints, nothing that moves."""
+def field_query(
+    device: wp.Device, set_size: int, set_count: int, seed: int, hints: int = 0
+) -> field_kernels.FieldQuery:
+    """Return the struct that goes with a grid into every kernel: sets of directions, room for hints, and no movers."""
     query = field_kernels.FieldQuery()
     query.mode, query.verify = field_kernels.MODE_THREE_STATE, 1.0
     query.set_size, query.set_count = set_size, set_count
@@ -106,8 +113,10 @@ def words_of(resolution: int) -> int:
     return -(-resolution * resolution // field_kernels.TEXELS_A_WORD)
 
 
-def grid_struct(grid: Grid, resolution: int, slots: wp.array | None, masks: wp.array | None) -> Any:
-    """Return the kernels' struct of a grid."""
+def grid_struct(
+    grid: Grid, resolution: int, slots: wp.array | None, masks: wp.array | None
+) -> field_kernels.VisibilityGrid:
+    """Return the kernels' struct of a grid; kernels that look up no slots, or no masks, take None for them."""
     data = field_kernels.VisibilityGrid()
     data.low = wp.vec3(*grid.low)
     data.cell_size = grid.cell_size
@@ -122,30 +131,30 @@ class Pieces:
     """Parts of surfaces in cells, sorted by cell; a piece is one side of a triangle in one cell."""
 
     cells: np.ndarray
-    """int32 [cell], rising: the cells that have any."""
+    """int32 [cell]: numbers in the grid of the cells that hold pieces, rising."""
     starts: np.ndarray
-    """int64 [cell + 1]: first piece of each."""
+    """int64 [cell + 1]: first piece of each cell, and the number of pieces."""
     sides: np.ndarray
-    """int32 [piece]: 2 triangle + side; side 1 is the back."""
+    """int32 [piece]: 2 * triangle + side; side 1 is the back."""
     areas: np.ndarray
-    """float64 [piece], m^2."""
+    """float64 [piece]: area, m^2."""
     edge_counts: np.ndarray
-    """int32 [piece]: samples on edges."""
+    """int32 [piece]: samples on the piece's edges."""
 
 
 class FieldBaker:
-    """Bakes the masks of cells of a scene at rest. What a cell gets depends on nothing but the scene around it.
+    """Bakes masks of cells, of the scene as it stands. What a cell gets depends on nothing but the scene around it.
 
     Args:
         geometry: Triangles as kernels read them.
         bvh: What blocks rays.
-        radius: Of the scene [m].
+        radius: Radius of the scene [m].
         grid: The cells.
-        settings: ``samples``, ``rays``, ``resolution`` and ``dilation`` of a VisibilityField.
-        device: Where it runs.
+        settings: What decides the masks; the cell size is that of ``grid``.
+        device: Where kernels run.
         seed: Decides every sample and ray.
         left_out: int32 [object], 1 for objects whose surfaces are not sampled; None samples all.
-        area: Of all triangles [m^2], which the density follows from; None is that of ``geometry`` as it is now.
+        area: Area of all triangles [m^2], which decides the density; None is that of ``geometry`` as it is now.
     """
 
     def __init__(
@@ -154,7 +163,7 @@ class FieldBaker:
         bvh: types.Bvh,
         radius: float,
         grid: Grid,
-        settings: Any,
+        settings: MaskSettings,
         device: wp.Device,
         seed: int = 0,
         left_out: np.ndarray | None = None,
@@ -218,7 +227,7 @@ class FieldBaker:
         return Pieces(present, np.append(begins, len(order)), side[order], areas[order].astype(np.float64), edge_counts)
 
     def bake(self, pieces: Pieces, progress: Callable[[float], None] | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return masks uint32 [cell, words] and SLOT_LABEL flags int32 [cell] of ``pieces.cells``."""
+        """Return masks, uint32 [cell, words], and flags, int32 [cell] (SLOT_LABEL or 0), of ``pieces.cells``."""
         count = len(pieces.cells)
         masks, flags = np.empty((count, self.words), np.uint32), np.empty(count, np.int32)
         cumulative = np.append(0.0, np.cumsum(pieces.areas))
@@ -243,7 +252,8 @@ class FieldBaker:
         self.samples += int(samples.sum())
         return masks, flags
 
-    def _surfaces(self, pieces: Pieces, begin: int, end: int, by_area: np.ndarray) -> Any:
+    def _surfaces(self, pieces: Pieces, begin: int, end: int, by_area: np.ndarray) -> bake_kernels.CellSurfaces:
+        """Return the pieces of cells ``begin`` to ``end`` - 1 and how many samples each cell gets, as kernels read."""
         device = self.device
         first, last = pieces.starts[begin], pieces.starts[end]
         starts = pieces.starts[begin : end + 1] - first
@@ -263,7 +273,7 @@ class FieldBaker:
         surfaces.step = wp.array(_golden_steps(by_area), dtype=wp.int32, device=device)
         return surfaces
 
-    def _bake_batch(self, surfaces: Any, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _bake_batch(self, surfaces: bake_kernels.CellSurfaces, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         count, device = len(samples), self.device
         merge = bake_kernels.MergeCells()
         merge.raw, merge.masks, merge.settled = (

@@ -10,16 +10,17 @@ from warp_gi.scene.camera import Camera
 from warp_gi.scene.scene import Scene
 from warp_gi.techniques.bake_tool import BakeTool, Rows, times
 from warp_gi.techniques.visibility_field import export as export_files
+from warp_gi.techniques.visibility_field import pictures
 from warp_gi.techniques.visibility_field.estimator import VisibilityField
 
 
-class VisibilityFieldTool(BakeTool):
+class VisibilityFieldTool(BakeTool[VisibilityField]):
     """Bakes the cells that a camera path sees, or all of them."""
 
     settings = VisibilityField
     summary = (
         "Which way the sky is seen, in the cells that the camera path sees; --everywhere: in all.",
-        "Of the geometry alone: one bake serves every sky, only the pictures depend on it.",
+        "It depends on the geometry alone: one bake serves every sky, only the pictures depend on it.",
     )
     shows = ("maps, labels, how many rays are left to trace, and the error",)
     exports = ("a .png for each layer (#### is its number), or one .exr",)
@@ -33,7 +34,7 @@ class VisibilityFieldTool(BakeTool):
 
     def check(self, settings: VisibilityField, everywhere: bool) -> None:
         """Raise OptionError for the mode that uses no bake."""
-        if settings.mode == "traced":
+        if not settings.uses_cells:
             raise OptionError('mode "traced" uses no bake; choose another, or render with it as it is')
 
     def check_scene(self, settings: VisibilityField, scene: Scene) -> None:
@@ -52,10 +53,10 @@ class VisibilityFieldTool(BakeTool):
         self, scene: Scene, camera: Camera, bake: Bake, settings: VisibilityField, folder: Path, device: str, seed: int
     ) -> list[Path]:
         """Write maps, labels, shares of traced rays, and the error."""
-        return export_files.write_pictures(scene, camera, bake, settings, folder, device, seed)
+        return pictures.write_pictures(scene, camera, bake, settings, folder, device, seed)
 
     def rows(self, bake: Bake, seconds: float) -> Rows:
-        """Return counts of cells, samples and rays, and how fast they were."""
+        """Return counts of cells, samples and rays, and rays a second."""
         counts = bake.counts
         return [
             ("cells", int(counts["cells"])),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,26 +17,38 @@ from warp_gi.estimator import Ahead, Estimator
 from warp_gi.kernels import harmonics as harmonics_kernels
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_trace as trace_kernels
+from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.techniques.visibility_field.bake import field_query, grid_of
-from warp_gi.techniques.visibility_field.state import RAYS_A_MILLISECOND, FieldState, cells_on_path, corners_of
+from warp_gi.techniques.visibility_field.settings import MaskSettings
+from warp_gi.techniques.visibility_field.state import (
+    RAYS_A_MILLISECOND,
+    FieldState,
+    cells_on_path,
+    corners_of,
+    stored_settings,
+)
 
 if TYPE_CHECKING:
     from warp_gi.frame import Frame
-    from warp_gi.scene.baked import BakedScene
     from warp_gi.scene.scene import Scene
 
 _MODES = {
     "three_state": field_kernels.MODE_THREE_STATE,
     "unbiased": field_kernels.MODE_UNBIASED,
     "paper": field_kernels.MODE_PAPER,
-    "traced": field_kernels.MODE_THREE_STATE,
+    "traced": field_kernels.MODE_THREE_STATE,  # without cells every ray is unknown, and traced
 }
 _SKIES = ("map", "harmonics")
-COSINE_SETS = 32  # turned about the normal at random, so few will do, and few stay in the first cache
+COSINE_SETS = 32
+"""Sets of cosine-weighted directions in a frame; each is turned about the normal at random, so few sets will do, and
+few stay in the processor's first cache."""
 MOST_SET_SIZE = 4096
+"""Largest number of directions in a set."""
 MOST_SET_SAMPLES = 1 << 16
+"""Largest number of sky samples in all sets of a frame, unless there are only 16 sets."""
 MOST_RESOLUTION = 512
+"""Largest number of texels along a side of a cell's masks."""
 
 
 @dataclass(frozen=True)
@@ -52,14 +63,14 @@ class VisibilityField(Estimator):
     term: ClassVar[str] = "environment"
 
     mode: Literal["three_state", "unbiased", "paper", "traced"] = "three_state"
-    """What a ray does: "three_state" traces what the cell calls mixed or unknown; "unbiased" traces a share of the rest
-    too, and corrects for what that finds; "paper" is the paper's one-sided test with labels, and needs sky "harmonics";
-    "traced" traces all without any bake, to compare with."""
+    """Which rays are traced: "three_state" traces those that the cell calls mixed or unknown; "unbiased" traces a share
+    of the other rays too, and corrects for what that finds; "paper" is the paper's one-sided test with labels, and
+    needs sky "harmonics"; "traced" traces every ray without any bake, to compare with."""
     sky: Literal["map", "harmonics"] = "map"
-    """"map" samples the sky as it is, by the BSDF and by its radiance; "harmonics" is its low frequencies only, in nine
-    coefficients a channel."""
+    """How the sky is read: "map" samples it as it is, by the BSDF and by its radiance; "harmonics" keeps only its low
+    frequencies, in nine coefficients a channel."""
     cell_size: float = 0.0
-    """Metres; 0 is a 77th of the scene's longest axis, as in the paper's Sponza."""
+    """Edge of a cell in metres; 0 is a 77th of the scene's longest axis, as in the paper's Sponza."""
     resolution: int = 84
     """Texels along a side of a cell's masks; the paper has 18."""
     samples: int = 0
@@ -69,7 +80,7 @@ class VisibilityField(Estimator):
     dilation: int = 1
     """Texels by which the masks of a cell are dilated."""
     verify: float = 0.1
-    """Share of the sure rays that the mode "unbiased" traces."""
+    """Share of the rays that a cell calls visible or occluded which the mode "unbiased" traces all the same."""
     lazy: bool = True
     """Bake only cells that the camera path sees, and others as they come into view; else all before the first frame."""
     budget: float = 100.0
@@ -107,17 +118,27 @@ class VisibilityField(Estimator):
         if not (math.isfinite(self.budget) and self.budget >= 0):
             raise OptionError(f"budget must be milliseconds of at least 0, got {self.budget}")
 
+    @property
+    def uses_cells(self) -> bool:
+        """Whether cells are baked and looked up; the mode "traced" traces every ray without any."""
+        return self.mode != "traced"
+
+    @property
+    def mask_settings(self) -> MaskSettings:
+        """The settings that decide the masks."""
+        whole = {name: int(getattr(self, name)) for name in ("resolution", "samples", "rays", "dilation")}
+        return MaskSettings(cell_size=self.cell_size, **whole)
+
     # ---- bake ----
 
     def bake_key(self, scene: Scene | BakedScene) -> str:
         """Return the hash of the geometry: nothing else decides visibility."""
-        return scene.geometry_hash
+        return whole_scene(scene).geometry_hash
 
     def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Any]:
         """Return the settings that decide the masks, with the cell size in metres."""
-        names = ("resolution", "samples", "rays", "dilation")
-        settings = {name: int(getattr(self, name)) for name in names}
-        return {"cell_size": grid_of(scene.bounds, self.cell_size).cell_size, **settings}
+        settings = self.mask_settings
+        return stored_settings(settings, grid_of(scene.bounds, settings.cell_size))
 
     def bake(
         self,
@@ -128,46 +149,49 @@ class VisibilityField(Estimator):
         camera: Camera | CameraPath | None = None,
     ) -> Bake | None:
         """Return the masks of all cells, or, when ``lazy`` and there is a camera, of those that it sees."""
-        if self.mode == "traced":
+        if not self.uses_cells:
             return None
-        state = FieldState(scene, launch.get_device(device), self, seed)
+        state = FieldState(scene, launch.get_device(device), self.mask_settings, seed)
         cells = cells_on_path(state, camera) if self.lazy and camera is not None else None
         state.bake(cells, progress)
         return state.to_bake()
 
     def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> FieldState:
         """Return the state of a field with the masks of a bake."""
-        target = launch.get_device(device)
+        scene, target = whole_scene(scene), launch.get_device(device)
         if bake is None:
-            return FieldState(scene, target, self, seed)
-        return FieldState.from_bake(scene, target, self, seed, bake)
+            return FieldState(scene, target, self.mask_settings, seed)
+        return FieldState.from_bake(scene, target, self.mask_settings, seed, bake)
 
     # ---- frames ----
 
     @property
     def saves_state(self) -> bool:
-        """Whether a saved state holds all that frames before left: not transfers, of 108 bytes a pixel."""
+        """Whether a saved state holds all that frames before left. Transfers, 108 bytes a pixel, are not saved."""
         return not self.relight
 
     @property
     def _grows(self) -> bool:
-        return self.mode != "traced" and self.lazy and self.budget > 0
+        return self.uses_cells and self.lazy and self.budget > 0
 
     def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
-        """Return whether a frame may find cells that those before it baked, or what pixels transferred then.
+        """Return whether a frame may use cells that earlier frames baked, or transfers that they kept.
 
         No cells are baked on the way if nothing moves and all cells that the frames ahead see are known.
         """
         if self.relight or not self._grows:
             return self.relight
-        return ahead is None or bool(scene.moving_objects) or ahead.state.lacks(ahead.views)
+        return ahead is None or bool(whole_scene(scene).moving_objects) or ahead.state.lacks(ahead.views)
 
     def preprocess(self, frame: Frame, state: FieldState) -> FieldState:
-        """Bake what came into view, within the budget; draw the frame's samples; look at the sky and at what moves."""
-        state = copy.copy(state)
+        """Return the state for this frame: new cells within the budget, samples, the sky, and boxes of movers."""
+        state = state.copied()
         state.query = self._query(frame)
         state.sky = self._sky(frame)
-        self._bake_in_view(frame, state)
+        if self.uses_cells:
+            self._bake_in_view(frame, state)
+        else:
+            state.upload_nothing()
         if self.relight and not _is_black(frame.scene):
             key = self._relight_key(frame, state)
             state.relights = state.transfer_key == key
@@ -178,27 +202,23 @@ class VisibilityField(Estimator):
         return state
 
     def _bake_in_view(self, frame: Frame, state: FieldState) -> None:
-        if self.mode == "traced":
-            none = wp.empty(0, dtype=wp.int32, device=frame.device), wp.empty(0, dtype=wp.uint32, device=frame.device)
-            state.upload()
-            state.data.slots, state.data.masks = none
-            return
+        """Bake cells that the camera sees, within the budget, in a state that is this frame's own."""
         state.move(frame.time)
         most_rays = self.budget * RAYS_A_MILLISECOND
         if self._grows:
             cells = state.cells_in_view(frame.camera, corners_of(frame.index))
             state.bake(cells, None, most_rays)
-            if state.movers and state.rests:
-                state.bake_rest(cells, most_rays)
+            if state.movers and state.is_still:
+                state.bake_settled(cells, most_rays)
         state.upload()
 
-    def _query(self, frame: Frame) -> Any:
+    def _query(self, frame: Frame) -> field_kernels.FieldQuery:
         size = min(-(-frame.settings.spp // 8) * 8, MOST_SET_SIZE)
         query = field_query(frame.device, size, COSINE_SETS, frame.seed)
         query.mode, query.verify = _MODES[self.mode], self.verify
         return query
 
-    def _sky(self, frame: Frame) -> Any:
+    def _sky(self, frame: Frame) -> trace_kernels.FieldSky:
         environment, sky = frame.scene.environment, trace_kernels.FieldSky()
         sky.set_size, sky.set_count = 1, 1
         if environment is None or environment.is_black:
@@ -221,7 +241,7 @@ class VisibilityField(Estimator):
         return sky
 
     def trace(self, frame: Frame, state: FieldState) -> None:
-        """Add the light of the current camera sample, or of all of them when the pixels' transfers are known."""
+        """Add the light of the current camera sample; where transfers are known, the first one adds that of all."""
         if _is_black(frame.scene):
             return
         if self.relight and state.relights:
@@ -237,7 +257,7 @@ class VisibilityField(Estimator):
         inputs = [frame.data, frame.camera_data, frame.pass_settings, field, frame.hits, buffers]
         frame.launch_tiled(trace_kernels.trace_field, inputs)
 
-    def _relight_key(self, frame: Frame, state: FieldState) -> tuple[Any, ...]:
+    def _relight_key(self, frame: Frame, state: FieldState) -> tuple[object, ...]:
         poses = b"".join(pose.tobytes() for pose in state.poses or ())
         camera = frame.camera
         return camera.world_from_camera.tobytes(), camera.hfov, camera.resolution, poses, len(state.cells)
@@ -248,5 +268,5 @@ def _is_black(scene: Scene | BakedScene) -> bool:
 
 
 def _set_count(size: int) -> int:
-    """Return how many sets of samples a frame draws, a power of two."""
+    """Return how many sets of ``size`` sky samples a frame draws, a power of two."""
     return 1 << max(min(MOST_SET_SAMPLES // size, 256), 16).bit_length() - 1

@@ -1,11 +1,9 @@
 """The state of a visibility field while it renders: masks of cells, what moves, and what is baked on the way.
 
-Two layers. The lasting one is baked without the objects that can move. It stays right wherever they are: what it calls
-occluded is, and what it calls visible is unless the ray meets one of their boxes, and then the ray is traced. Their own
-surfaces are not in it, so their pixels trace. Once everything has come to rest, cells in view are baked again with all
-that is there; this second layer is dropped at the next motion.
-
-A frame works on a shallow copy: every method puts new arrays in the place of those that it changes.
+There are two layers of cells. The static layer is baked without the objects that can move. It stays right wherever
+they are: what it calls occluded is, and what it calls visible is unless the ray meets one of their boxes, and then the
+ray is traced. Their own surfaces are not in it, so their pixels trace. While nothing moves from one frame to the next,
+cells in view are baked again with every object where it is: the settled layer, which is dropped at the next motion.
 """
 
 from __future__ import annotations
@@ -13,8 +11,9 @@ from __future__ import annotations
 import copy
 import hashlib
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Literal
 
 import numpy as np
 import warp as wp
@@ -25,64 +24,117 @@ from warp_gi.errors import BakeError
 from warp_gi.kernels import gbuffer
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_bake as bake_kernels
+from warp_gi.kernels import visibility_field_trace as trace_kernels
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.pinhole import camera_data
 from warp_gi.scene.scene import Scene
 from warp_gi.techniques.visibility_field.bake import FieldBaker, Grid, grid_of, grid_struct, words_of
+from warp_gi.techniques.visibility_field.settings import MaskSettings
 
 RAYS_A_MILLISECOND = 20_000
-"""What a budget of milliseconds is reckoned with on every machine, so that pictures do not depend on its speed."""
+"""Rays that a millisecond of a budget pays for on every machine, so that pictures do not depend on its speed."""
+
+Layer = Literal["static", "settled"]
+
+
+@dataclass(frozen=True, eq=False)
+class SettledLayer:
+    """Cells that were baked with every object where it has been since the last motion."""
+
+    cells: np.ndarray
+    """int32 [slot]: numbers in the grid of the cells that hold surfaces, in the order they were baked."""
+    masks: np.ndarray
+    """uint32 [slot, words]: masks of those cells."""
+    flags: np.ndarray
+    """int32 [slot]: occlusion labels of those cells, SLOT_LABEL or 0."""
+    empty: np.ndarray
+    """int32 [number]: numbers in the grid of cells in which no surface was found."""
+
+    @classmethod
+    def nothing(cls, words: int) -> SettledLayer:
+        """Return a layer without cells, whose masks would have so many words."""
+        none = np.empty(0, np.int32)
+        return cls(none, np.empty((0, words), np.uint32), none, none)
+
+    @property
+    def known(self) -> np.ndarray:
+        """int32 [number]: all cells that were looked at, those without a surface last."""
+        return np.concatenate([self.cells, self.empty])
 
 
 class FieldState:
     """Masks of a field on a device, growing as cells come into view.
 
+    A frame's state is a shallow copy (``copied``) of the one that the last frame left. ``bake``, ``bake_settled``,
+    ``move``, ``upload`` and ``upload_nothing`` change the state that they are called on, so call them on a copy, or on
+    a state that no frame has yet. They put new arrays and structs in the place of those that they change, and the
+    state that was copied stays as it is. ``trace`` changes nothing but ``transfer``, which ``preprocess`` made for the
+    frame.
+
     Args:
-        scene: What is rendered.
-        device: Where.
-        settings: The VisibilityField.
-        seed: Of all baking.
+        scene: Scene that is rendered.
+        device: Where masks are baked and looked up.
+        settings: What decides the masks.
+        seed: Seed of all samples and rays of baking.
     """
 
-    def __init__(self, scene: Scene, device: wp.Device, settings: Any, seed: int) -> None:
+    def __init__(self, scene: Scene, device: wp.Device, settings: MaskSettings, seed: int) -> None:
         self.scene, self.device, self.settings, self.seed = scene, device, settings, seed
         self.grid: Grid = grid_of(scene.bounds, settings.cell_size)
         self.words = words_of(settings.resolution)
+        """32-bit words of a cell's masks."""
         self.slots = np.full(self.grid.cell_count, field_kernels.NO_SLOT, np.int32)
+        """int32 [cell]: slot of each cell of the grid in the static layer, with its flags; NO_SLOT where none is."""
         self.masks = np.empty((0, self.words), np.uint32)
+        """uint32 [slot, words]: masks of the static layer."""
         self.cells = np.empty(0, np.int32)
-        """int32 [slot]: the cell of each slot of the lasting layer, in the order they were baked."""
+        """int32 [slot]: number in the grid of each cell of the static layer, in the order they were baked."""
         self.seconds = 0.0
+        """Wall seconds spent on baking the static layer."""
         self.counts: dict[str, int] = {"samples": 0, "rays": 0, "rays_traced": 0}
+        """Surface samples of the static layer, their rays, and how many of those were traced."""
         self.movers = scene.moving_objects
+        """Node of each object that can move, by the object's number."""
         self.poses: list[np.ndarray] | None = None
-        self.rests = False
+        """float64 [4, 4]: world matrix of each mover in the last frame; None before the first one."""
+        self.is_still = False
         """Whether nothing moved between the last two frames."""
-        self.rest: dict[int, tuple[np.ndarray, int] | None] = {}
-        """Cells of the layer that is baked with everything at rest: masks and flags, None without any surface."""
+        self.settled = SettledLayer.nothing(self.words)
+        """Cells that were baked since the last motion; without any unless ``is_still``."""
         self.empty = np.zeros(self.grid.cell_count, bool)
-        """[cell] True where no surface was found, and nothing is left to bake."""
-        self.data: Any = None
-        self.query: Any = None
-        self.sky: Any = None
-        self.transfer: Any = None
-        """float32 [27 * pixel] what each harmonic adds, of the frame that ``transfer_key`` is of; None if not kept."""
-        self.transfer_key: tuple[Any, ...] | None = None
+        """bool [cell]: cells in which baking the static layer found no surface."""
+        self.data = grid_struct(self.grid, settings.resolution, None, None)
+        """Grid of this frame as kernels read it; without cells before the first frame."""
+        self.query = field_kernels.FieldQuery()
+        """Directions and boxes of movers of this frame as kernels read them; empty before the first frame."""
+        self.sky = trace_kernels.FieldSky()
+        """Sky of this frame as kernels read it; empty before the first frame."""
+        self.transfer: wp.array | None = None
+        """float32 [27 * pixel]: what each harmonic of a white sky adds to a pixel, in the frame that ``transfer_key``
+        belongs to; None unless the field relights."""
+        self.transfer_key: tuple[object, ...] | None = None
+        """Camera, poses and number of cells that ``transfer`` belongs to; None if there is none."""
         self.relights = False
-        """Whether the frame has its light from ``transfer``, which is known then; else it fills that."""
+        """Whether ``transfer`` is known, and this frame's light comes from it; else the frame fills it."""
         self._start_count, self._start_empty = 0, self.empty
-        self._bakers: dict[str, FieldBaker] = {}
-        self._dirty = True
+        self._bakers: dict[Layer, FieldBaker] = {}
+        """Made when first used, and shared by all copies: they hold nothing that a frame leaves behind."""
+        self._is_stale = True
+        """Whether the grid on the device lacks cells that the state has."""
 
     @property
     def flags(self) -> np.ndarray:
-        """int32 [slot]: the occlusion label of each slot of the lasting layer, as SLOT_LABEL or 0."""
+        """int32 [slot]: occlusion label of each cell of the static layer, SLOT_LABEL or 0."""
         return self.slots[self.cells] & field_kernels.SLOT_LABEL
+
+    def copied(self) -> FieldState:
+        """Return a shallow copy for a frame to change."""
+        return copy.copy(self)
 
     # ---- to and from a bake ----
 
     @classmethod
-    def from_bake(cls, scene: Scene, device: wp.Device, settings: Any, seed: int, bake: Bake) -> FieldState:
+    def from_bake(cls, scene: Scene, device: wp.Device, settings: MaskSettings, seed: int, bake: Bake) -> FieldState:
         """Return the state that a bake holds. Raises BakeError if it is not whole."""
         state = cls(scene, device, settings, seed)
         try:
@@ -105,32 +157,30 @@ class FieldState:
         return state
 
     def to_bake(self) -> Bake:
-        """Return the lasting layer as a bake, the cells that frames added among it."""
+        """Return the static layer as a bake, with the cells that frames added."""
         low, shape = self.grid.low, np.array(self.grid.shape, np.int32)
         counts = {**self.counts, "cells": len(self.cells), "seconds": round(self.seconds, 3)}
         arrays = {"cells": self.cells, "flags": self.flags, "masks": self.masks, "grid_low": low, "grid_shape": shape}
         arrays["empty_cells"] = np.flatnonzero(self.empty).astype(np.int32)
         arrays["grid_cell_size"] = np.array([self.grid.cell_size])
-        settings = self.settings.bake_settings(self.scene)
-        key = self.settings.bake_key(self.scene)
-        return Bake(type(self.settings).__name__, key, settings, arrays, counts, self.scene.name)
+        settings = stored_settings(self.settings, self.grid)
+        return Bake("VisibilityField", self.scene.geometry_hash, settings, arrays, counts, self.scene.name)
 
     # ---- to and from what frames leave behind ----
 
     def saved_arrays(self) -> dict[str, np.ndarray]:
         """Return what frames added to the state before the first one: cells of both layers, and poses."""
-        added, first = slice(self._start_count, None), np.zeros((0, self.words), np.uint32)
-        rest = {cell: entry for cell, entry in self.rest.items() if entry is not None}
+        added = slice(self._start_count, None)
         return {
-            "start": np.frombuffer(self._start_digest().digest(), np.uint8),
+            "start": np.frombuffer(self._start_digest(), np.uint8),
             "cells": self.cells[added],
             "flags": self.flags[added],
             "masks": self.masks[added],
             "empty_cells": np.flatnonzero(self.empty & ~self._start_empty).astype(np.int32),
-            "rest_cells": np.array(list(rest), np.int32),
-            "rest_flags": np.array([flags for _, flags in rest.values()], np.int32),
-            "rest_masks": np.stack([masks for masks, _ in rest.values()]) if rest else first,
-            "rest_empty_cells": np.array([cell for cell, entry in self.rest.items() if entry is None], np.int32),
+            "settled_cells": self.settled.cells,
+            "settled_flags": self.settled.flags,
+            "settled_masks": self.settled.masks,
+            "settled_empty_cells": self.settled.empty,
             "poses": np.array(self.poses or np.zeros((0, 4, 4)), np.float64),
         }
 
@@ -139,33 +189,33 @@ class FieldState:
 
         Raises KeyError where one is missing, ValueError if they are of a field that began with other cells.
         """
-        if arrays["start"].tobytes() != self._start_digest().digest():
+        if arrays["start"].tobytes() != self._start_digest():
             raise ValueError("the field began with other cells")
-        state, count = copy.copy(self), self._start_count
+        state, count = self.copied(), self._start_count
         state.slots = self.slots.copy()
         state.slots[self.cells[count:]] = field_kernels.NO_SLOT
         state.cells, state.masks = self.cells[:count], self.masks[:count]
         state._add(arrays["cells"], arrays["masks"], arrays["flags"])
         state.empty = self._start_empty.copy()
         state.empty[arrays["empty_cells"]] = True
-        state.rest = dict.fromkeys(arrays["rest_empty_cells"].tolist())
-        rest = zip(arrays["rest_masks"], arrays["rest_flags"].tolist(), strict=True)
-        state.rest |= dict(zip(arrays["rest_cells"].tolist(), rest, strict=True))
+        names = ("cells", "masks", "flags", "empty_cells")
+        state.settled = SettledLayer(*(arrays[f"settled_{name}"] for name in names))
         state.poses = list(arrays["poses"]) or None
         state.transfer, state.transfer_key = None, None
         return state
 
-    def _start_digest(self) -> Any:
+    def _start_digest(self) -> bytes:
+        """Return a SHA-256 over the cells that were known before the first frame."""
         start = np.concatenate([self.cells[: self._start_count], np.flatnonzero(self._start_empty)])
-        return hashlib.sha256(start.astype(np.int64).tobytes())
+        return hashlib.sha256(start.astype(np.int64).tobytes()).digest()
 
     # ---- baking ----
 
-    def baker(self, layer: str) -> FieldBaker:
-        """Return what bakes the "lasting" layer, or the one where everything is "at rest"."""
+    def baker(self, layer: Layer) -> FieldBaker:
+        """Return what bakes a layer: "static" without the objects that can move, "settled" with them."""
         if layer not in self._bakers:
             data = self.scene.data(self.device)
-            if layer == "lasting":
+            if layer == "static":
                 bvh = self.scene.resting_bvh(self.device).data
                 left_out = np.zeros(len(self.scene.object_names), np.int32)
                 left_out[list(self.movers)] = 1
@@ -175,9 +225,20 @@ class FieldState:
             self._bakers[layer] = FieldBaker(data.geometry, bvh, *place, left_out, self.scene.surface_area)
         return self._bakers[layer]
 
-    def bake(self, cells: np.ndarray | None = None, progress: Any = None, most_rays: float = np.inf) -> None:
-        """Add ``cells`` (all if None) to the lasting layer; of those, the first that ``most_rays`` pays for."""
-        started, baker = time.perf_counter(), self.baker("lasting")
+    def bake(
+        self,
+        cells: np.ndarray | None = None,
+        progress: Callable[[float], None] | None = None,
+        most_rays: float = np.inf,
+    ) -> None:
+        """Add cells to the static layer.
+
+        Args:
+            cells: int32 [number], numbers in the grid, the most wanted first; None is all of them.
+            progress: Called with the share done in [0, 1].
+            most_rays: Rays that are traced at most, about; cells for which they do not suffice are left out.
+        """
+        started, baker = time.perf_counter(), self.baker("static")
         if cells is not None:
             cells = cells[(self.slots[cells] < 0) & ~self.empty[cells]]
             if len(cells) == 0:
@@ -198,7 +259,7 @@ class FieldState:
     def _affordable(self, baker: FieldBaker, cells: np.ndarray, most_rays: float) -> np.ndarray:
         if not np.isfinite(most_rays):
             return np.sort(cells)
-        a_cell = 2 * baker.density * self.grid.cell_size**2 * baker.rays / 4  # about what is traced of a flat wall's
+        a_cell = 2 * baker.density * self.grid.cell_size**2 * baker.rays / 4  # rays traced for a flat wall, about
         return np.sort(cells[: max(int(most_rays / a_cell), 1)])
 
     def _add(self, cells: np.ndarray, masks: np.ndarray, flags: np.ndarray) -> None:
@@ -207,33 +268,38 @@ class FieldState:
         self.slots[cells] = np.arange(len(self.cells), len(self.cells) + len(cells), dtype=np.int32) | flags | boxed
         self.cells = np.concatenate([self.cells, cells.astype(np.int32)])
         self.masks = np.concatenate([self.masks, masks])
-        self._dirty = True
+        self._is_stale = True
 
-    def bake_rest(self, cells: np.ndarray, most_rays: float) -> None:
-        """Bake ``cells`` with everything where it is now, the first that ``most_rays`` pays for."""
-        cells = np.array([cell for cell in cells.tolist() if cell not in self.rest], np.int32)
+    def bake_settled(self, cells: np.ndarray, most_rays: float) -> None:
+        """Bake cells, int32 [number], with every object where it is now; the first ones that ``most_rays`` pays for."""
+        known = self.settled
+        cells = cells[~np.isin(cells, known.known)]
         if len(cells) == 0:
             return
-        baker = self.baker("at rest")
+        baker = self.baker("settled")
         cells = self._affordable(baker, cells, most_rays)
         pieces = baker.find(cells)
         masks, flags = baker.bake(pieces)
-        found = {int(cell): (masks[i], int(flags[i])) for i, cell in enumerate(pieces.cells)}
-        self.rest = self.rest | dict.fromkeys(cells.tolist(), None) | found
-        self._dirty = True
+        self.settled = SettledLayer(
+            np.concatenate([known.cells, pieces.cells.astype(np.int32)]),
+            np.concatenate([known.masks, masks]),
+            np.concatenate([known.flags, flags]),
+            np.concatenate([known.empty, cells[~np.isin(cells, pieces.cells)]]),
+        )
+        self._is_stale = True
 
     # ---- a frame ----
 
     def move(self, now: float) -> None:
-        """Take note of where everything is at ``now`` [s]; what was baked at rest is dropped if anything moved."""
+        """Take note of where everything is at ``now`` [s], and drop the settled layer if anything moved."""
         poses = [self.scene.world_from_node(node, now) for node in self.movers.values()]
         moved = self.poses is None or any(not np.array_equal(a, b) for a, b in zip(poses, self.poses, strict=True))
         if moved and self.movers:
-            self.rest = {}
-            self._dirty = True
-        self.rests = not moved
+            self.settled = SettledLayer.nothing(self.words)
+            self._is_stale = True
+        self.is_still = not moved
         self.poses = poses
-        if self.query is not None and self.movers:
+        if self.movers:
             boxes = [self.scene.node_box(node, now) for node in self.movers.values()]
             margin = 1e-4 * self.scene.radius
             corners = np.concatenate([np.stack([low - margin, high + margin]) for low, high in boxes])
@@ -243,21 +309,25 @@ class FieldState:
             self.query.moving = wp.array(moving, dtype=wp.int32, device=self.device)
 
     def upload(self) -> None:
-        """Bring ``data``, the grid as kernels read it, up to date."""
-        if not self._dirty:
+        """Bring ``data``, the grid as kernels read it, up to date; settled cells take the place of static ones."""
+        if not self._is_stale:
             return
-        slots, masks = self.slots, self.masks
-        rest = {cell: entry for cell, entry in self.rest.items() if entry is not None}
-        if rest:
+        slots, masks, settled = self.slots, self.masks, self.settled
+        if len(settled.cells):
             slots = slots.copy()
-            cells = np.fromiter(rest, np.int32, len(rest))
-            flags = np.array([flag for _, flag in rest.values()], np.int32)
-            slots[cells] = np.arange(len(masks), len(masks) + len(rest), dtype=np.int32) | flags
-            masks = np.concatenate([masks, np.stack([mask for mask, _ in rest.values()])])
-        slots_array = wp.array(slots, dtype=wp.int32, device=self.device)
-        masks_array = wp.array(masks.reshape(-1), dtype=wp.uint32, device=self.device)
+            new = np.arange(len(masks), len(masks) + len(settled.cells), dtype=np.int32)
+            slots[settled.cells] = new | settled.flags
+            masks = np.concatenate([masks, settled.masks])
+        slots_array: wp.array = wp.array(slots, dtype=wp.int32, device=self.device)
+        masks_array: wp.array = wp.array(masks.reshape(-1), dtype=wp.uint32, device=self.device)
         self.data = grid_struct(self.grid, self.settings.resolution, slots_array, masks_array)
-        self._dirty = False
+        self._is_stale = False
+
+    def upload_nothing(self) -> None:
+        """Make ``data`` a grid without any cell, so that kernels trace every ray."""
+        slots = wp.empty(0, dtype=wp.int32, device=self.device)
+        masks = wp.empty(0, dtype=wp.uint32, device=self.device)
+        self.data = grid_struct(self.grid, self.settings.resolution, slots, masks)
 
     def lacks(self, views: Iterable[tuple[int, Camera]]) -> bool:
         """Return whether one of these frames, by number and camera, sees cells that are still to be baked."""
@@ -268,7 +338,7 @@ class FieldState:
         return False
 
     def cells_in_view(self, camera: Camera, corners: Sequence[int] = range(4)) -> np.ndarray:
-        """Return the cells that a camera sees, int32, those seen most first.
+        """Return the cells that a camera sees, int32 [number], those seen most first.
 
         It looks through those pixels of each block of 2 x 2 that ``corners`` name, 0 to 3.
         """
@@ -284,6 +354,11 @@ class FieldState:
         cells, counts = np.unique(np.concatenate(views), return_counts=True)
         order = np.lexsort((cells, -counts))
         return cells[order][cells[order] >= 0]
+
+
+def stored_settings(settings: MaskSettings, grid: Grid) -> dict[str, float | int]:
+    """Return the settings that a bake stores and is checked by, with the cell size in metres."""
+    return {**asdict(settings), "cell_size": grid.cell_size}
 
 
 def corners_of(frame: int) -> tuple[int]:
