@@ -78,7 +78,7 @@ class Bake:
             "warp_gi": __version__,
         }
         record["sha256"] = _seal(record, _digest(arrays))
-        with replacing(path) as part:
+        with replacing(path, own_folder=True) as part:  # save_file writes to a file of another name first
             try:
                 save_file(arrays, part, {FORMAT: json.dumps(record, sort_keys=True)})
             except SafetensorError as error:

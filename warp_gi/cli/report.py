@@ -18,7 +18,7 @@ from warp_gi import launch
 
 LINE_SECONDS = 10.0
 LOG_WIDTH, LONGEST_WORD, GAP = 200, 24, 3
-"""Characters of a table's line where no terminal limits it, of a word in one that is not broken, between columns."""
+"""Characters in a table's line where no terminal limits it, in the longest unbroken word, and between columns."""
 _M_MMAP_THRESHOLD = -3
 _LARGE_BLOCK = 1 << 20
 
@@ -67,7 +67,7 @@ class Reporter:
 
     @contextmanager
     def shares(self, name: str) -> Iterator[Callable[[float], None]]:
-        """Yield what is told the share done of ``name``: a bar on a terminal, a line every 10 s or more elsewhere."""
+        """Yield a function to call with the share of ``name`` done: shows a bar on a terminal, elsewhere a line each 10 s."""
         started = told = time.perf_counter()
         if self.terminal:
             from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn

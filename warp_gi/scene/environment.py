@@ -36,7 +36,7 @@ from warp_gi.scene.watching import Watch
 __all__ = ["Environment", "SunSky", "as_environment"]
 
 LARGEST_HEIGHT = 4096  # texel coordinates must be exact in float32 with bits left to interpolate
-NEGLIGIBLE_NEGATIVE = 1e-4  # of the sum of all pixels
+NEGLIGIBLE_NEGATIVE = 1e-4  # share of the sum of all pixels; less is set to 0
 
 
 class SkyMap:

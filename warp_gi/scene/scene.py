@@ -98,7 +98,7 @@ class Scene:
 
     @property
     def lock(self) -> threading.RLock:
-        """A re-entrant lock: whoever holds it, as each frame and bake does, is the only one to move or edit the scene.
+        """A re-entrant lock. Its holder alone may move or edit the scene, as each frame and bake does.
 
         Take it around ``update`` and what is read after it, where other threads render.
         """
@@ -356,7 +356,7 @@ class Scene:
         return self._devices[_device(device).alias].bvh
 
     def resting_bvh(self, device: str | wp.Device | None = None) -> TriangleBvh:
-        """Return a TriangleBvh of what never moves; ``bvh`` itself if nothing does."""
+        """Return the TriangleBvh of the nodes that never move; it is ``bvh`` itself if nothing moves."""
         with self.lock:
             self.data(device)
             return self._devices[_device(device).alias].resting_bvh()

@@ -46,7 +46,9 @@ class Watch:
 
     def __init__(self, owners: Sequence[Owner], bare: bool = False) -> None:
         pairs = [owner if isinstance(owner, tuple) else (owner, _field_names(owner)) for owner in owners]
-        self._owners = [(owner, names, attrgetter(*names)) for owner, names in pairs]  # of two names at least
+        self._owners = [
+            (owner, names, attrgetter(*names)) for owner, names in pairs
+        ]  # attrgetter returns a tuple for two or more names
         self._values: list[tuple[Any, ...]] = [get(owner) for owner, _, get in self._owners]
         self._lists: list[tuple[Change, list[object], list[object]]] = []
         self._arrays: list[tuple[Change, np.ndarray]] = []
@@ -99,7 +101,7 @@ class _Checksums:
         self.arrays = arrays
         self.sizes = [array.nbytes for array in arrays]
         counts = [-(-size // CHUNK) for size in self.sizes]
-        self.index = np.repeat(np.arange(len(arrays)), counts)  # of each chunk's array
+        self.index = np.repeat(np.arange(len(arrays)), counts)  # index in `arrays` of each chunk's array
         table = np.zeros(len(self.index), checksum.MemoryChunk.numpy_dtype())
         starts = np.array([array.__array_interface__["data"][0] for array in arrays], np.uint64)
         sizes = np.array(self.sizes, np.int64)

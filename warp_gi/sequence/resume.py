@@ -178,7 +178,7 @@ class SequenceRun:
         self.scheduler, self.shots, self.output = scheduler, tuple(shots), output
 
     def bake(self) -> None:
-        """Bake under the sky of the first frame, whichever of them will be rendered: resumed or not, it is the same."""
+        """Bake under the sky of the sequence's first frame, so that a resumed sequence has the same bake."""
         with self.scheduler.scene.lock:
             self.scheduler.scene.update_sky(self.shots[0].time)
             self.scheduler.bake()
