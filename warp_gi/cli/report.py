@@ -67,7 +67,7 @@ class Reporter:
 
     @contextmanager
     def shares(self, name: str) -> Iterator[Callable[[float], None]]:
-        """Yield a function to call with the share of ``name`` done: shows a bar on a terminal, elsewhere a line each 10 s."""
+        """Yield a function that takes the share of ``name`` done, and shows it: a bar, or a line every 10 s or more."""
         started = told = time.perf_counter()
         if self.terminal:
             from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
