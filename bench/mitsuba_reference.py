@@ -48,7 +48,7 @@ PICTURES: dict[str, Picture] = {
     "spheres_lamp": Picture("spheres", materials=PLAIN, max_depth=5),
     "spheres_interior": Picture("spheres_interior", materials=PLAIN, max_depth=5),
 }
-"""By the names of their files."""
+"""Pictures by the names of their files."""
 
 
 def integrator(max_depth: int, masks: bool) -> Any:

@@ -32,8 +32,8 @@ STARTING_SHARE = 0.8
 """Share of the time in which something new is started."""
 ASK = """
 import json, sys
-from warp_gi.bench.harness import runner
-print(json.dumps([runner.environment(sys.argv[1]), list(runner.suites())]))
+from warp_gi.bench.harness import catalogue, runner
+print(json.dumps([runner.environment(sys.argv[1]), list(catalogue.suites())]))
 """
 Row = dict[str, Any]
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import warp_gi as gi
-from warp_gi.bench.harness import runner
+from warp_gi.bench.harness.catalogue import ROOT
 from warp_gi.bench.harness.places import PLACES
 from warp_gi.cli.report import start_warp
 from warp_gi.errors import GiError, OptionError, unknown_name
@@ -23,7 +23,6 @@ from warp_gi.files import check_writable, replacing
 from warp_gi.sequence.exr import stored_values
 from warp_gi.sequence.preview import tone_map, write_png
 
-ROOT = runner.FOLDER.parent
 WIDTH, SPP = 480, 64
 QUALITY = 88
 
@@ -45,7 +44,7 @@ README_PICTURES = {
     "assets/atrium.jpg": ReadmePicture(("atrium",), (960, 540), 64, frame=20),
     "assets/places.jpg": ReadmePicture(("street", "warehouse", "two_rooms", "sphere_row"), (240, 135), 256, columns=4),
 }
-"""By file."""
+"""Pictures by file."""
 
 
 def render(name: str, size: tuple[int, int], spp: int, frame: int = 0, device: str = "cpu") -> np.ndarray:

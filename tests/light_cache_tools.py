@@ -11,10 +11,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import warp as wp
+from scene_tools import quad
 from statistics_tools import device
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import quad
 from warp_gi.kernels import bsdf, light_cache, light_cache_build, light_hierarchy, ltc, samples, surface, types
 from warp_gi.kernels.emitters import LightChoice, punctual_light
 from warp_gi.launch import copied, launch

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from scene_tools import unit
 
 NEAREST = 0.95
 """Distance from the anchor, over the sphere's radius, beyond which there is no parallax."""
-
-
-def unit(v: np.ndarray) -> np.ndarray:
-    """Return vectors [..., 3] of length one."""
-    return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
 def random_directions(count: int, seed: int = 1) -> np.ndarray:

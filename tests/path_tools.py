@@ -11,11 +11,10 @@ from statistics_tools import device
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.alias import AliasTable
 from warp_gi.kernels import gbuffer, path_trace, types
 from warp_gi.kernels.path_trace import TERM_EMITTERS, TERM_ENVIRONMENT, TERM_INDIRECT
+from warp_gi.paths import sky_probability
 from warp_gi.scene.pinhole import camera_data
-from warp_gi.techniques.paths.estimators import sky_probability
 
 EVERYTHING = TERM_ENVIRONMENT | TERM_EMITTERS | TERM_INDIRECT
 
@@ -25,7 +24,7 @@ def scene_data(scene: gi.Scene) -> Any:
     data = launch.copied(scene.data(device()), types.SceneData)
     data.emitters = launch.copied(data.emitters, types.Emitters)
     if scene.emitter_count:
-        data.emitters.alias = AliasTable.build(gi.PowerLights().weights(scene)).on(device())
+        data.emitters.alias = scene.light_table(device())
     return data
 
 

@@ -13,7 +13,13 @@ import numpy as np
 from PIL import Image
 
 import warp_gi as gi
+from warp_gi.bench.harness.scenes import light, sphere
+from warp_gi.bench.harness.scenes import quad as parallelogram
 from warp_gi.scene.model import Material, Mesh
+
+__all__ = ["GREY", "GlbBuilder", "card", "light", "loss_by_depth", "png", "quad", "sphere", "triangle", "unit"]
+
+GREY = Material("grey", (0.7, 0.6, 0.5), specular=0.0)
 
 TRIANGLE_POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
 TRIANGLE_UVS = np.array([[0, 0], [1, 0], [0, 1]], np.float32)
@@ -23,6 +29,25 @@ def triangle(material: Material | None = None, **fields: Any) -> Mesh:
     """Return a right triangle in the xy plane, facing +z, with unit legs."""
     defaults = {"points": TRIANGLE_POINTS.copy(), "indices": np.array([[0, 1, 2]], np.int32)}
     return Mesh(**{**defaults, "material": material or Material(), **fields})
+
+
+def quad(corner: Any, edge_u: Any, edge_v: Any, material: Material = GREY, name: str = "quad") -> Mesh:
+    """Return a parallelogram whose front is the side that ``edge_u`` x ``edge_v`` points to."""
+    return parallelogram(corner, edge_u, edge_v, material, name)
+
+
+def card(z: float = 0.0, half: float = 1.0, material: Material | None = None) -> Mesh:
+    """Return a square in the plane of z, facing +z; 0.5, 0.25, 0.125 Lambert unless told."""
+    material = material or Material(base_color=(0.5, 0.25, 0.125), specular=0.0)
+    return quad((-half, -half, z), (2 * half, 0, 0), (0, 2 * half, 0), material)
+
+
+def unit(vectors: Any) -> np.ndarray:
+    """Return vectors [..., 3] of length one, in float64 unless they are float32."""
+    vectors = np.asarray(vectors)
+    if vectors.dtype != np.float32:
+        vectors = vectors.astype(np.float64)
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def png(pixels: np.ndarray) -> bytes:

@@ -1,5 +1,6 @@
 """Bake files: what comes back, what is refused and why, whole or not at all."""
 
+import hashlib
 import json
 import os
 import subprocess
@@ -7,8 +8,8 @@ import sys
 
 import numpy as np
 import pytest
+from safetensors.numpy import load_file, save
 
-from warp_gi import baking
 from warp_gi.baking import Bake, load_bake
 from warp_gi.errors import BakeError, GiError
 
@@ -42,20 +43,6 @@ def refused(path):
     message = str(caught.value)
     assert message.startswith(f"{path}: ") and "\n" not in message
     return message.removeprefix(f"{path}: ")
-
-
-def rewrite(path, change, seal=True):
-    """Let ``change`` edit the metadata of a bake file, in the file's own form."""
-    data = path.read_bytes()
-    length = int.from_bytes(data[:8], "little")
-    fields = json.loads(data[8 : 8 + length])
-    metadata = fields["__metadata__"]
-    change(metadata)
-    if seal:
-        texts = {key: text for key, text in metadata.items() if key not in ("format", "metadata_sha256")}
-        metadata["metadata_sha256"] = baking._seal(texts)
-    header = json.dumps(fields, separators=(",", ":")).encode()
-    path.write_bytes(len(header).to_bytes(8, "little") + header + data[8 + length :])
 
 
 def test_bakes_come_back_bit_equal(tmp_path):
@@ -112,88 +99,79 @@ def test_numpy_scalars_become_plain_numbers(tmp_path):
 def test_any_name_of_a_scene_can_be_stored(tmp_path):
     assert load_bake(make_bake(scene_name='Häuser "2"\n').save(tmp_path / "a.bake")).scene_name == 'Häuser "2"\n'
     undecodable = os.fsdecode(b"hall\xff.glb")
-    assert load_bake(make_bake(scene_name=undecodable).save(tmp_path / "b.bake")).scene_name == "hall\\udcff.glb"
+    assert load_bake(make_bake(scene_name=undecodable).save(tmp_path / "b.bake")).scene_name == undecodable
 
 
 def test_equal_bakes_write_equal_bytes(tmp_path):
+    """In every process: each hashes strings by another seed."""
     first = make_bake().save(tmp_path / "a.bake").read_bytes()
     other = make_bake()
     other.arrays = dict(reversed(other.arrays.items()))
     other.settings = dict(reversed(other.settings.items()))
     assert other.save(tmp_path / "b.bake").read_bytes() == first
-    assert load_bake(tmp_path / "a.bake").save(tmp_path / "c.bake").read_bytes() == first
     script = "import sys; from warp_gi.baking import load_bake; load_bake(sys.argv[1]).save(sys.argv[2])"
-    subprocess.run([sys.executable, "-c", script, tmp_path / "a.bake", tmp_path / "d.bake"], check=True)
-    assert (tmp_path / "d.bake").read_bytes() == first
+    for seed in ("0", "1", "2"):
+        environment = {**os.environ, "PYTHONHASHSEED": seed}
+        subprocess.run(
+            [sys.executable, "-c", script, tmp_path / "a.bake", tmp_path / "d.bake"], env=environment, check=True
+        )
+        assert (tmp_path / "d.bake").read_bytes() == first
 
 
 def test_files_are_safetensors_of_aligned_arrays(tmp_path):
-    from safetensors import safe_open
-    from safetensors.numpy import load_file
-
     bake = make_bake()
     path = bake.save(tmp_path / "a.bake")
     for name, array in load_file(path).items():
         np.testing.assert_array_equal(array, bake.arrays[name])
-    with safe_open(path, framework="np") as file:
-        metadata = file.metadata()
-    assert metadata["format"] == "warp_gi bake" and metadata["format_version"] == "1"
-    assert json.loads(metadata["settings"]) == bake.settings and json.loads(metadata["counts"]) == bake.counts
     data = path.read_bytes()
     length = int.from_bytes(data[:8], "little")
     assert length % 8 == 0
-    for name, entry in json.loads(data[8 : 8 + length]).items():
-        if name != "__metadata__":
-            assert entry["data_offsets"][0] % bake.arrays[name].itemsize == 0
+    header = json.loads(data[8 : 8 + length])
+    record = json.loads(header.pop("__metadata__")["warp_gi bake"])
+    assert record["settings"] == bake.settings and record["counts"] == bake.counts and record["format_version"] == 2
+    assert all(entry["data_offsets"][0] % bake.arrays[name].itemsize == 0 for name, entry in header.items())
 
 
-def test_truncated_files_are_refused(tmp_path):
+def first_format(bake, **changes):
+    """Return the metadata of format version 1, one entry for each value."""
+    texts = {"format_version": "1", "warp_gi": "0.1.0", "sha256": bake.digest}
+    texts |= {name: getattr(bake, name) for name in ("technique", "scene_key", "scene_name")}
+    texts |= {name: json.dumps(getattr(bake, name), sort_keys=True) for name in ("settings", "counts")}
+    seal = hashlib.sha256(json.dumps(texts, sort_keys=True).encode()).hexdigest()
+    return {"format": "warp_gi bake", **texts, "metadata_sha256": seal, **changes}
+
+
+def test_files_of_the_first_format_are_read(tmp_path):
+    bake, path = make_bake(), tmp_path / "a.bake"
+    path.write_bytes(save(bake.arrays, first_format(bake)))
+    back = load_bake(path)
+    assert (back.technique, back.scene_key, back.scene_name) == (bake.technique, bake.scene_key, bake.scene_name)
+    assert (back.settings, back.counts, back.digest) == (bake.settings, bake.counts, bake.digest)
+    for changes in ({"scene_key": OTHER_KEY}, {"settings": "{"}, {"sha256": "0"}, {"format_version": "one"}):
+        path.write_bytes(save(bake.arrays, first_format(bake, **changes)))
+        assert refused(path).startswith("is damaged")
+    path.write_bytes(save(bake.arrays | {"area": np.zeros(2)}, first_format(bake)))
+    assert refused(path).startswith("is damaged")
+
+
+def test_damaged_files_are_refused(tmp_path):
+    """Whatever byte is changed or lost."""
     path = make_bake().save(tmp_path / "a.bake")
     data = path.read_bytes()
-    header = 8 + int.from_bytes(data[:8], "little")
     path.write_bytes(b"")
     assert refused(path).startswith("is empty")
-    for size in range(1, len(data)):
+    for size in range(1, len(data), 3):
         path.write_bytes(data[:size])
-        message = refused(path)
-        if size <= 8:
-            assert message.startswith(f"has only {size} bytes: truncated, or not")
-        elif size < header:
-            assert message.startswith("is truncated: "), size
-        else:
-            assert message.startswith(f"is truncated: {len(data) - size} bytes are missing"), size
-
-
-def test_any_changed_byte_is_found(tmp_path):
-    path = make_bake().save(tmp_path / "a.bake")
-    data = path.read_bytes()
-    header = 8 + int.from_bytes(data[:8], "little")
+        assert refused(path).startswith("is truncated, damaged or no bake at all (")
     for position in range(len(data)):
-        for mask in (0x01, 0x20, 0xFF):
-            changed = bytearray(data)
-            changed[position] ^= mask
-            path.write_bytes(changed)
-            message = refused(path)
-            if position >= header:
-                assert message.startswith("is damaged: its arrays are not those that were written")
-    path.write_bytes(data + b"\0")
-    assert refused(path).startswith("is damaged")
+        changed = bytearray(data)
+        changed[position] ^= (0x01, 0x20, 0xFF)[position % 3]
+        path.write_bytes(changed)
+        refused(path)
+    path.write_bytes(data[:-5] + b"12345")
+    assert refused(path) == "is damaged: it does not hold what was written; delete it and bake again"
     path.write_bytes(data)
     load_bake(path)
-
-
-@pytest.mark.parametrize(
-    "old, new",
-    [(b'"I32"', b'"F32"'), (b'"F64"', b'"C64"'), (b'"depth"', b'"dep\\u0000"'), (b"[5]", b"[1,5]")],
-)
-def test_changed_headers_are_found(tmp_path, old, new):
-    path = make_bake().save(tmp_path / "a.bake")
-    data = path.read_bytes()
-    length = int.from_bytes(data[:8], "little")
-    header = data[8 : 8 + length].replace(old, new)
-    assert header != data[8 : 8 + length]
-    path.write_bytes(len(header).to_bytes(8, "little") + header + data[8 + length :])
-    assert refused(path).startswith("is damaged: its ")  # 0.4 does not know C64
 
 
 def test_types_that_numpy_lacks_are_refused(tmp_path):
@@ -202,39 +180,34 @@ def test_types_that_numpy_lacks_are_refused(tmp_path):
     length = int.from_bytes(data[:8], "little")
     header = data[8 : 8 + length].replace(b'"F16"', b'"BF16"')
     path.write_bytes(len(header).to_bytes(8, "little") + header + data[8 + length :])
-    assert refused(path).startswith("is damaged: its arrays")
+    assert refused(path).startswith("is damaged")
 
 
-FOREIGN = {
-    "random": np.random.default_rng(2).bytes(4096),
-    "png": b"\x89PNG\r\n\x1a\n" + bytes(100),
-    "text": b"# cameras of the hall\n" * 20,
-    "short text": b"hello, world\n",
-    "json": b'{"format": "warp_gi bake"}',
-    "zeros": bytes(64),
-    "nested": (50_000).to_bytes(8, "little") + b"[" * 50_000,
-    "list": (2).to_bytes(8, "little") + b"[]",
-    "glb": b"glTF\x02\x00\x00\x00" + bytes(60),
-    "zip": b"PK\x03\x04" + bytes(100),
-}
-
-
-@pytest.mark.parametrize("name", FOREIGN)
-def test_foreign_files_are_refused(tmp_path, name):
+@pytest.mark.parametrize(
+    "record, message",
+    [
+        ({"format_version": 3}, "is a bake of format version 3, "),
+        ({"format_version": "two"}, "is damaged"),
+        ({}, "is damaged"),
+        ([], "is damaged"),
+        ({"format_version": 2, "settings": 7}, "is damaged"),
+    ],
+)
+def test_other_records_are_refused(tmp_path, record, message):
     path = tmp_path / "a.bake"
-    path.write_bytes(FOREIGN[name])
-    assert refused(path).startswith("is not a warp_gi bake")
+    path.write_bytes(save(make_bake().arrays, {"warp_gi bake": json.dumps(record)}))
+    assert refused(path).startswith(message)
+    path.write_bytes(save(make_bake().arrays, {"warp_gi bake": "[" * 100_000}))
+    assert refused(path).startswith("is damaged")
 
 
-@pytest.mark.parametrize("metadata", [None, {"format": "pt"}, {"settings": "{}"}])
-@pytest.mark.parametrize("lost", [0, 3])
-def test_safetensors_by_others_are_refused(tmp_path, metadata, lost):
-    from safetensors.numpy import save
-
-    data = save({"weights": np.ones(3)}, metadata)
-    path = tmp_path / "a.safetensors"
-    path.write_bytes(data[: len(data) - lost])
-    assert refused(path).startswith("is a safetensors file by another program, not a warp_gi bake")
+@pytest.mark.parametrize("content", [b"# cameras of the hall\n" * 20, bytes(64), b"\x89PNG\r\n\x1a\n" + bytes(100)])
+def test_foreign_files_are_refused(tmp_path, content):
+    (tmp_path / "a.bake").write_bytes(content)
+    assert "or no bake at all" in refused(tmp_path / "a.bake")
+    for metadata in (None, {"format": "pt"}, {"settings": "{}"}):
+        (tmp_path / "a.bake").write_bytes(save({"weights": np.ones(3)}, metadata))
+        assert refused(tmp_path / "a.bake").startswith("is a safetensors file by another program")
 
 
 def test_missing_files_and_folders_are_refused(tmp_path):
@@ -242,38 +215,6 @@ def test_missing_files_and_folders_are_refused(tmp_path):
     assert refused(tmp_path).startswith("is a folder")
     (tmp_path / "file").write_text("")
     assert refused(tmp_path / "file" / "a.bake").startswith("no such file")
-
-
-@pytest.mark.parametrize("lost", [0, 3])
-def test_newer_formats_are_refused(tmp_path, lost):
-    path = make_bake().save(tmp_path / "a.bake")
-    rewrite(path, lambda metadata: metadata.update(format_version="2"))
-    path.write_bytes(path.read_bytes()[: path.stat().st_size - lost])
-    message = refused(path)
-    assert message.startswith("is a bake of format version 2, ") and "reads 1;" in message
-
-
-@pytest.mark.parametrize("version", ["0", "-1", "two", "", "1.0", "9" * 5000])
-def test_other_format_versions_are_damage(tmp_path, version):
-    path = make_bake().save(tmp_path / "a.bake")
-    rewrite(path, lambda metadata: metadata.update(format_version=version))
-    assert refused(path).startswith("is damaged: its format version is ")
-
-
-def test_metadata_must_be_whole(tmp_path):
-    for key in [*baking._TEXTS, "metadata_sha256"]:
-        path = make_bake().save(tmp_path / "a.bake")
-        rewrite(path, lambda metadata, key=key: metadata.pop(key), seal=False)
-        assert refused(path).startswith("is damaged: its ")
-    for key, text in [("settings", "{"), ("counts", "[1]"), ("settings", "7"), ("counts", "[" * 100_000)]:
-        path = make_bake().save(tmp_path / "a.bake")
-        rewrite(path, lambda metadata, key=key, text=text: metadata.update({key: text}))
-        assert refused(path).startswith("is damaged: its settings or counts are unreadable")
-    path = make_bake().save(tmp_path / "a.bake")
-    rewrite(path, lambda metadata: metadata.update(scene_key=OTHER_KEY), seal=False)
-    assert refused(path).startswith("is damaged: its metadata are not those that were written")
-    rewrite(path, lambda metadata: metadata.update(format_version=2))  # not even text
-    assert refused(path).startswith("is a bake of format version 2")
 
 
 def unsuitable(bake, *arguments):
@@ -342,40 +283,20 @@ def test_what_cannot_come_back_is_refused_on_saving(tmp_path):
     assert issubclass(BakeError, GiError)
 
 
-class FullDisk:
-    """A file that takes ``space`` bytes."""
-
-    def __init__(self, file, space):
-        self.file, self.space = file, space
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self.file.close()
-
-    def write(self, data):
-        data = memoryview(data)
-        self.file.write(data[: self.space])
-        self.space -= data.nbytes
-        if self.space < 0:
-            raise OSError(28, "No space left on device")
-
-
-@pytest.mark.parametrize("space", [0, 100, 1700])
-def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch, space):
+def test_a_full_disk_leaves_the_old_file(tmp_path):
+    """A limit on the size of files stands for the disk's."""
     path = make_bake().save(tmp_path / "a.bake")
     old = path.read_bytes()
-    larger = make_bake(arrays={"values": np.arange(1000)}, scene_name="hall")
-    monkeypatch.setattr(baking, "open", lambda *how: FullDisk(open(*how), space), raising=False)
+    script = (
+        "import resource, signal, sys, numpy as np; from warp_gi.baking import Bake; "
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000))\n"
+        "try:\n    Bake('T', '', {}, {'values': np.arange(9000)}).save(sys.argv[1])\n"
+        "except OSError as error:\n    print(error.errno, error.filename)"
+    )
     for target in (path, tmp_path / "new.bake"):
-        with pytest.raises(OSError, match="No space left on device") as caught:
-            larger.save(target)
-        assert caught.value.errno == 28 and caught.value.filename == str(target)
-    monkeypatch.undo()
+        told = subprocess.run([sys.executable, "-c", script, target], capture_output=True, text=True, check=True)
+        assert told.stdout == f"27 {target}\n"
     assert os.listdir(tmp_path) == ["a.bake"] and path.read_bytes() == old
-    larger.save(path)
-    assert load_bake(path).scene_name == "hall"
 
 
 def test_importing_does_not_need_safetensors():

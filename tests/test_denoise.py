@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import warp as wp
+from scene_tools import card
 
 import warp_gi as gi
 from warp_gi import launch
@@ -157,12 +158,6 @@ def test_separated_light_put_back_is_the_light(lobes):
 SIZE = (32, 24)
 
 
-def quad(z, half, material):
-    points = np.float32([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
-    uvs = np.float32([[0, 0], [1, 0], [1, 1], [0, 1]])
-    return gi.Mesh(points, np.array([[0, 1, 2], [0, 2, 3]], np.int32), material, uvs=uvs)
-
-
 def checkered(metallic=0.0):
     rng = np.random.default_rng(3)
     texture = gi.Texture("checks", rng.integers(0, 255, (8, 8, 4), dtype=np.uint8) | np.uint8([0, 0, 0, 255]))
@@ -173,9 +168,9 @@ def scene(environment=(0.3, 0.4, 0.5)):
     """A textured card before a textured wall, and a lamp."""
     lamp = gi.Material("lamp", emission=(9.0, 6.0, 3.0))
     nodes = [
-        gi.Node("wall", [quad(-2.0, 5.0, checkered())]),
-        gi.Node("card", [quad(0.0, 0.7, checkered())]),
-        gi.Node("lamp", [quad(4.0, 0.5, lamp)]),
+        gi.Node("wall", [card(-2.0, 5.0, checkered())]),
+        gi.Node("card", [card(0.0, 0.7, checkered())]),
+        gi.Node("lamp", [card(4.0, 0.5, lamp)]),
     ]
     return gi.Scene(nodes, environment=environment)
 
@@ -195,7 +190,7 @@ def lengths(scheduler):
 
 def test_textures_under_even_light_are_not_blurred():
     """One Lambert plane under a constant sky has no noise, so that a denoiser has nothing to change."""
-    plane = gi.Scene([gi.Node("wall", [quad(-2.0, 9.0, checkered())])], environment=(0.3, 0.4, 0.5))
+    plane = gi.Scene([gi.Node("wall", [card(-2.0, 9.0, checkered())])], environment=(0.3, 0.4, 0.5))
     scheduler = gi.FrameScheduler(plane, sideways(), gi.Pipeline(spp=4, denoise=SpatioTemporal()))
     for index in (0, 1):
         frame = scheduler.frame(index)
@@ -311,7 +306,7 @@ def test_lobes_that_an_estimator_hands_over():
     frame = next(gi.render(scene(), view, gi.Pipeline(indirect=Apart(diffuse=2.0), **only)))
     assert frame.numpy("indirect").max() > 0.5
     assert np.allclose(frame.numpy("beauty"), frame.numpy("noisy"), rtol=1e-5, atol=1e-6)
-    metal = gi.Scene([gi.Node("wall", [quad(0.0, 9.0, checkered(1.0))])])
+    metal = gi.Scene([gi.Node("wall", [card(0.0, 9.0, checkered(1.0))])])
     frame = next(gi.render(metal, view, gi.Pipeline(indirect=Apart(glossy=1.0), **only)))
     inner = (slice(4, -4), slice(4, -4))
     spread = [frame.numpy(name)[inner].std() for name in ("noisy", "beauty")]

@@ -5,21 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
+from scene_tools import card, sphere
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import sphere
 from warp_gi.errors import OptionError
 from warp_gi.kernels.sampling import random_1d
 from warp_gi.launch import set_threads
 
 SIZE = (24, 16)
-
-
-def quad(z=0.0, half=1.0, material=None):
-    """A square in the plane of z, facing +z; 0.5, 0.25, 0.125 Lambert unless told."""
-    points = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]], np.float32)
-    indices = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    return gi.Mesh(points, indices, material or gi.Material(base_color=(0.5, 0.25, 0.125), specular=0.0))
 
 
 def lit_scene(**settings):
@@ -28,10 +21,10 @@ def lit_scene(**settings):
     aside = np.eye(4)
     aside[:3, 3] = (1.5, 0.8, -1.0)
     nodes = [
-        gi.Node("glow", [quad(half=0.2, material=lamp)], aside),
-        gi.Node("wall", [quad(-2.0, 5.0)]),
-        gi.Node("card", [quad()]),
-        gi.Node("lamp", [quad(4.0, 0.5, lamp)]),
+        gi.Node("glow", [card(half=0.2, material=lamp)], aside),
+        gi.Node("wall", [card(-2.0, 5.0)]),
+        gi.Node("card", [card()]),
+        gi.Node("lamp", [card(4.0, 0.5, lamp)]),
     ]
     return gi.Scene(nodes, environment=(0.3, 0.4, 0.5), **settings)
 
@@ -162,7 +155,7 @@ def test_motion_of_the_sky_follows_the_turn_of_the_camera():
     """A card far away and small: everything else is sky."""
     keys = (gi.CameraKey(0.0, (0, 0, 9), (0, 0, 0)), gi.CameraKey(1.0, (0, 0, 9), (-1, 0, 0)))
     path = gi.CameraPath(keys, fps=1, resolution=SIZE)
-    scene = gi.Scene([gi.Node("card", [quad(half=0.1)])], environment=(1.0, 1.0, 1.0))
+    scene = gi.Scene([gi.Node("card", [card(half=0.1)])], environment=(1.0, 1.0, 1.0))
     frame = next(gi.render(scene, path, gi.Pipeline(spp=1, camera_samples=1), frames=[1]))
     x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
     now = path.camera(1)
@@ -204,7 +197,7 @@ def test_metadata_and_timings_tell_how_it_was_made():
 
 
 def test_a_scene_without_light_is_black():
-    scene = gi.Scene([gi.Node("wall", [quad()])])
+    scene = gi.Scene([gi.Node("wall", [card()])])
     assert not one_frame(scene).numpy("beauty").any()
 
 
@@ -275,7 +268,7 @@ def test_a_lamp_that_moved_lights_like_one_that_stands_there():
 
     def scene(lamp):
         glow = gi.Material("lamp", emission=(3.0, 2.0, 1.0))
-        return gi.Scene([gi.Node("wall", [quad(-2.0, 5.0)]), gi.Node("card", [quad()]), lamp(quad(3.0, 0.5, glow))])
+        return gi.Scene([gi.Node("wall", [card(-2.0, 5.0)]), gi.Node("card", [card()]), lamp(card(3.0, 0.5, glow))])
 
     there = np.eye(4)
     there[:3, 3] = (1.0, 2.0, 0.5)
@@ -315,7 +308,7 @@ def test_normals_that_point_to_the_back_of_their_triangles_are_turned():
 def test_variance_of_an_edge_counts_the_sky_beside_it():
     """A black card before a white sky: a pixel's samples are 0 or 1, so its variance follows from its mean."""
     black = gi.Material("black", (0.0, 0.0, 0.0), specular=0.0)
-    scene = gi.Scene([gi.Node("card", [quad(material=black)])], environment=(1.0, 1.0, 1.0))
+    scene = gi.Scene([gi.Node("card", [card(material=black)])], environment=(1.0, 1.0, 1.0))
     frame = one_frame(scene, pipeline=gi.Pipeline(spp=16, camera_samples=16))
     mean = frame.numpy("beauty").astype(np.float64)
     assert ((mean > 0.1) & (mean < 0.9)).any()

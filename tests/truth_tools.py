@@ -11,9 +11,9 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
+from scene_tools import light, quad, sphere, unit
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import light, quad, sphere
 
 MATERIALS = {  # base colour, metallic, roughness, specular
     "lambert": ((0.8, 0.5, 0.2), 0.0, 1.0, 0.0),
@@ -32,11 +32,6 @@ gauss_legendre = cache(np.polynomial.legendre.leggauss)
 
 
 # ---- scenes ----
-
-
-def unit(v: object) -> np.ndarray:
-    v = np.asarray(v, dtype=np.float64)
-    return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
 def scene_of(*meshes: gi.Mesh, environment: object = None, lights: Sequence[gi.PunctualLight] = ()) -> gi.Scene:

@@ -1,8 +1,8 @@
 """Bakes: what an estimator computes before the first frame, in memory and on disk.
 
 A file is in the safetensors format: mapped arrays, and no code runs on loading. It appears whole or
-not at all, equal bakes write equal bytes, and any changed byte is found on loading. The header is
-written here, because the library's own writer puts metadata in another order every time.
+not at all, equal bakes write equal bytes, and any changed byte is found on loading. All that is not an
+array is one entry of its metadata, in JSON: the library writes several in another order every time.
 """
 
 from __future__ import annotations
@@ -26,20 +26,10 @@ Setting = str | int | float
 """Value of a setting in a bake; bool is an int."""
 
 FORMAT = "warp_gi bake"
-FORMAT_VERSION = 1
-MOST_HEADER = 100_000_000  # bytes; safetensors reads no longer one
-_OPENING = f'{{"__metadata__":{{"format":"{FORMAT}"'.encode()  # how the header of every bake begins
-_TEXTS = ("format_version", "technique", "scene_key", "scene_name", "settings", "counts", "warp_gi", "sha256")
-_SEAL = "metadata_sha256"
-_CODES = {"bool": "BOOL"} | {
-    f"{kind}{bits}": f"{code}{bits}"
-    for kind, code, sizes in (
-        ("uint", "U", (8, 16, 32, 64)),
-        ("int", "I", (8, 16, 32, 64)),
-        ("float", "F", (16, 32, 64)),
-    )
-    for bits in sizes
-}  # NumPy's name of a type -> that of safetensors
+FORMAT_VERSION = 2
+_TEXTS = ("technique", "scene_key", "scene_name")
+_WHOLE = tuple(f"{kind}{bits}" for kind in ("uint", "int") for bits in (8, 16, 32, 64))
+_TYPES = ("bool", *_WHOLE, "float16", "float32", "float64")
 
 
 @dataclass(eq=False)
@@ -75,28 +65,25 @@ class Bake:
         Raises OSError when it cannot be written, TypeError for an array or a value of a type
         that a bake does not hold, BakeError for a number that is not finite.
         """
+        from safetensors import SafetensorError
+        from safetensors.numpy import save_file
+
         path = Path(path)
         arrays = {name: _stored(name, self.arrays[name]) for name in sorted(self.arrays)}
-        texts = {
-            "format_version": str(FORMAT_VERSION),
-            "technique": self.technique,
-            "scene_key": self.scene_key,
-            "scene_name": self.scene_name,
-            "settings": _json("setting", self.settings),
-            "counts": _json("count", self.counts),
+        record = {
+            "format_version": FORMAT_VERSION,
+            **{name: getattr(self, name) for name in _TEXTS},
+            "settings": _plain("setting", self.settings),
+            "counts": _plain("count", self.counts),
             "warp_gi": __version__,
-            "sha256": _digest(arrays),
         }
-        # a name that came from a file name may hold what UTF-8 cannot
-        texts = {key: text.encode("utf-8", "backslashreplace").decode() for key, text in texts.items()}
-        ordered = sorted(arrays.items(), key=lambda item: -item[1].itemsize)  # so that each is aligned
-        header = _header({"format": FORMAT, **texts, _SEAL: _seal(texts)}, ordered)
+        record["sha256"] = _seal(record, _digest(arrays))
         with replacing(path) as part:
             try:
-                with open(part, "wb") as file:
-                    file.write(header)
-                    for _, array in ordered:
-                        file.write(_bytes(array))
+                save_file(arrays, part, {FORMAT: json.dumps(record, sort_keys=True)})
+            except SafetensorError as error:
+                code = re.search(r"os error (\d+)", str(error))
+                raise OSError(int(code[1]) if code else 0, str(error), str(path)) from error
             except OSError as error:
                 raise OSError(error.errno, error.strerror, str(path)) from error
         return path
@@ -148,89 +135,55 @@ def load_bake(path: str | Path) -> Bake:
     try:
         with safe_open(path, framework="np") as file:
             metadata = file.metadata() or {}
-            _check_format(path, metadata)
+            record = _record(path, metadata)
             arrays = {name: file.get_tensor(name) for name in sorted(file.keys())}
+            digest = _digest(arrays)
     except SafetensorError as error:
-        raise _unreadable(path) from error
-    except (TypeError, AttributeError) as error:  # a type that NumPy lacks
-        raise _damaged(path, "its arrays are not of a type that a bake holds") from error
-    texts = {key: metadata[key] for key in _TEXTS if key in metadata}
-    if len(texts) < len(_TEXTS) or _SEAL not in metadata:
-        missing = ", ".join(key for key in (*_TEXTS, _SEAL) if key not in metadata)
-        raise _damaged(path, f"its metadata lack {missing}")
-    if metadata[_SEAL] != _seal(texts):
-        raise _damaged(path, "its metadata are not those that were written")
+        raise BakeError(
+            f"{path}: is truncated, damaged or no bake at all ({' '.join(str(error).split())}); "
+            "correct the path, or delete it and bake again"
+        ) from error
+    except (TypeError, AttributeError) as error:  # a type that a bake does not hold
+        raise _damaged(path) from error
+    seal = record.pop("sha256", None)
+    if seal != (digest if FORMAT not in metadata else _seal(record, digest)):
+        raise _damaged(path)
     try:
-        settings, counts = json.loads(texts["settings"]), json.loads(texts["counts"])
-    except (ValueError, RecursionError) as error:
-        raise _damaged(path, "its settings or counts are unreadable") from error
-    if not isinstance(settings, dict) or not isinstance(counts, dict):
-        raise _damaged(path, "its settings or counts are unreadable")
-    try:
-        is_same = texts["sha256"] == _digest(arrays)
-    except (TypeError, BakeError):
-        is_same = False
-    if not is_same:
-        raise _damaged(path, "its arrays are not those that were written")
-    return Bake(texts["technique"], texts["scene_key"], settings, arrays, counts, texts["scene_name"])
+        texts = [str(record[name]) for name in _TEXTS]
+        return Bake(*texts[:2], dict(record["settings"]), arrays, dict(record["counts"]), texts[2])
+    except (KeyError, TypeError, ValueError) as error:
+        raise _damaged(path) from error
 
 
-def _check_format(path: Path, metadata: Mapping[str, str]) -> None:
-    """Raise BakeError unless ``metadata`` are those of a bake in a format that this version reads."""
-    if metadata.get("format") != FORMAT:
+def _record(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+    """Return all that a file holds beside arrays; raises BakeError unless it is a bake that this version reads."""
+    if FORMAT not in metadata and metadata.get("format") != FORMAT:
         raise BakeError(
             f"{path}: is a safetensors file by another program, not a warp_gi bake; "
             "correct the path, or bake to another file"
         )
-    version = str(metadata.get("format_version", ""))
-    if not re.fullmatch("[1-9][0-9]{0,8}", version):
-        raise _damaged(path, f"its format version is {version!r}")
-    if int(version) > FORMAT_VERSION:
+    try:
+        if FORMAT in metadata:
+            record = json.loads(metadata[FORMAT])
+            version = int(record["format_version"])
+        else:  # version 1 had an entry for each
+            version = int(metadata["format_version"])
+            texts = {key: text for key, text in metadata.items() if key not in ("format", "metadata_sha256")}
+            record = texts | {key: json.loads(texts[key]) for key in ("settings", "counts")}
+            if metadata["metadata_sha256"] != hashlib.sha256(json.dumps(texts, sort_keys=True).encode()).hexdigest():
+                raise _damaged(path)
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise _damaged(path) from error
+    if version > FORMAT_VERSION:
         raise BakeError(
             f"{path}: is a bake of format version {version}, this warp_gi ({__version__}) reads "
-            f"{FORMAT_VERSION}; update warp_gi or bake again"
+            f"up to {FORMAT_VERSION}; update warp_gi or bake again"
         )
+    return record
 
 
-def _unreadable(path: Path) -> BakeError:
-    """Return why ``path``, a file that safetensors refused, is no whole bake."""
-    with open(path, "rb") as file:
-        length = int.from_bytes(file.read(8), "little")
-        header = file.read(min(length, MOST_HEADER))
-    body = path.stat().st_size - 8 - length  # bytes
-    try:
-        fields = json.loads(header)
-        metadata = fields.pop("__metadata__", {})
-        is_ours = metadata.get("format") == FORMAT
-        missing = max((entry["data_offsets"][1] for entry in fields.values()), default=0) - body
-        is_safetensors = is_ours or bool(fields)
-    except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
-        is_safetensors = False
-    if is_safetensors:  # its header is whole
-        try:
-            _check_format(path, metadata)
-        except BakeError as error:
-            return error
-        if missing > 0:
-            return _truncated(path, f"{missing} bytes are missing")
-        return _damaged(path, "its header is wrong")
-    if header.startswith(_OPENING):
-        if len(header) < length <= MOST_HEADER:
-            return _truncated(path, "it ends inside its header")
-        return _damaged(path, "its header is unreadable")
-    if header and len(header) < length <= MOST_HEADER and _OPENING.startswith(header):
-        return _truncated(path, f"it has only {len(header) + 8} bytes")
-    if not header and 0 < length <= MOST_HEADER:
-        return BakeError(f"{path}: has only {path.stat().st_size} bytes: truncated, or not a warp_gi bake; bake again")
-    return BakeError(f"{path}: is not a warp_gi bake; correct the path, or bake to another file")
-
-
-def _truncated(path: Path, why: str) -> BakeError:
-    return BakeError(f"{path}: is truncated: {why}; delete it and bake again")
-
-
-def _damaged(path: Path, why: str) -> BakeError:
-    return BakeError(f"{path}: is damaged: {why}; delete it and bake again")
+def _damaged(path: Path) -> BakeError:
+    return BakeError(f"{path}: is damaged: it does not hold what was written; delete it and bake again")
 
 
 def _stored(name: str, array: np.ndarray) -> np.ndarray:
@@ -241,14 +194,9 @@ def _stored(name: str, array: np.ndarray) -> np.ndarray:
     if not isinstance(name, str) or not name.isprintable() or name == "__metadata__":
         raise BakeError(f"array name {name!r} cannot be stored; expected printable text other than '__metadata__'")
     array = np.asarray(array)
-    if array.dtype.name not in _CODES:
-        raise TypeError(f"array {name!r} is {array.dtype}; a bake holds {', '.join(_CODES)}: convert it first")
+    if array.dtype.name not in _TYPES:
+        raise TypeError(f"array {name!r} is {array.dtype}; a bake holds {', '.join(_TYPES)}: convert it first")
     return np.asarray(array, array.dtype.newbyteorder("<"), order="C")
-
-
-def _bytes(array: np.ndarray) -> memoryview:
-    """Return a view of a contiguous array's bytes."""
-    return array.reshape(-1).view(np.uint8).data
 
 
 def _digest(arrays: Mapping[str, np.ndarray]) -> str:
@@ -257,29 +205,17 @@ def _digest(arrays: Mapping[str, np.ndarray]) -> str:
     for name in sorted(arrays):
         array = _stored(name, arrays[name])
         digest.update(json.dumps([name, array.dtype.name, array.shape]).encode())
-        digest.update(_bytes(array))
+        digest.update(array.reshape(-1).view(np.uint8))
     return digest.hexdigest()
 
 
-def _seal(texts: Mapping[str, str]) -> str:
-    """Return a SHA-256 over the metadata, in hexadecimal digits."""
-    return hashlib.sha256(json.dumps(texts, sort_keys=True).encode()).hexdigest()
+def _seal(record: Mapping[str, Any], digest: str) -> str:
+    """Return a SHA-256 over all that a file holds, in hexadecimal digits; ``digest`` is that of its arrays."""
+    return hashlib.sha256((json.dumps(record, sort_keys=True) + digest).encode()).hexdigest()
 
 
-def _header(metadata: Mapping[str, str], arrays: list[tuple[str, np.ndarray]]) -> bytes:
-    """Return what stands before the values in a safetensors file: length, JSON, spaces up to 8 bytes."""
-    fields: dict[str, Any] = {"__metadata__": metadata}
-    end = 0
-    for name, array in arrays:
-        start, end = end, end + array.nbytes
-        fields[name] = {"dtype": _CODES[array.dtype.name], "shape": array.shape, "data_offsets": [start, end]}
-    text = json.dumps(fields, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 8)
-    return len(text).to_bytes(8, "little") + text
-
-
-def _json(kind: str, values: Mapping[str, Any]) -> str:
-    """Return settings or counts as JSON, sorted; raises TypeError or BakeError for what would not come back equal."""
+def _plain(kind: str, values: Mapping[str, Any]) -> dict[str, str | int | float]:
+    """Return settings or counts as JSON has them; raises TypeError or BakeError for what would not come back equal."""
     plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
     for name, value in plain.items():
         if not isinstance(name, str) or not isinstance(value, (str, int, float)):
@@ -288,7 +224,7 @@ def _json(kind: str, values: Mapping[str, Any]) -> str:
             )
         if isinstance(value, float) and not math.isfinite(value):
             raise BakeError(f"{kind} {name!r} is {value}; a bake holds finite numbers only")
-    return json.dumps(plain, sort_keys=True, allow_nan=False)
+    return plain
 
 
 def _scene(name: str, key: str) -> str:

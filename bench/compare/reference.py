@@ -13,7 +13,7 @@ import numpy as np
 import warp_gi as gi
 from warp_gi import launch, metrics
 from warp_gi.bench.harness.measure import Row
-from warp_gi.bench.harness.presets import REFERENCE_DEPTH
+from warp_gi.bench.harness.scenes import REFERENCE_DEPTH
 from warp_gi.cli.compare import read_image
 from warp_gi.errors import OptionError, SceneError
 

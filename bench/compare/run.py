@@ -37,7 +37,7 @@ class Run:
     cpu: list[float] = field(default_factory=list)
     points: list[Point] = field(default_factory=list)
     sums: list[np.ndarray] = field(default_factory=list)
-    """Of frames 0, 2, 4, ... and of frames 1, 3, 5, ..., float64 [height, width, 3]."""
+    """Sums of frames 0, 2, 4, ... and of frames 1, 3, 5, ..., float64 [height, width, 3]."""
     first: np.ndarray | None = None
     """The first frame."""
     is_done: bool = False
@@ -98,7 +98,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What taking turns left."""
+    """The result of ``take_turns``."""
 
     runs: list[Run]
     equal_samples: dict[str, np.ndarray]

@@ -3,66 +3,26 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from warp_gi.bench.harness import records
-from warp_gi.bench.harness.runner import ENVIRONMENT
+from warp_gi.bench.harness import catalogue, records
+from warp_gi.bench.harness.columns import COUNT, SPREADS, Column, Columns
+from warp_gi.bench.harness.records import ENVIRONMENT
 from warp_gi.cli.report import print_table
 from warp_gi.errors import OptionError
 
-SETTINGS = frozenset(
-    {"spp", "resolution", "rays a pixel", "degrees", "bits", "migrations", "width", "height", "depth"}
-    | {"triangles", "lights", "Mpixels", "samples", "threads used"}
-)
-"""Numbers that say what was measured, as words do, and are no outcome."""
 MACHINE = ("cpu", "cores", "threads", "device")
 """Where these differ, times cannot be compared."""
-REMARKS = ("target", "targets", "says", "skipped", "failed")
 PEERS = ("mitsuba", "embree", "blender")
-"""What a row's renderer is called where it is not ours to be slower."""
-SPREADS = ("spread", "+-", "±")
-SERIES = re.compile(r"[-+.\deE]+(\s+[-+.\deE]+)+")
-"""Numbers in words, an outcome."""
+"""How the values of the column "renderer" begin that are not ours to be slower."""
 SPREADS_APART, LEAST_SHARE = 2.0, 0.03
 """How many of both spreads, half of the middle half each, medians of a few turns may differ by: one of twenty medians
 of five turns of the same does by more. The share is what runs of one machine differ by in any case; quick ones have too
 few turns to know their spread, and take the share of values without one."""
 Identity = tuple[tuple[str, Any], ...]
-
-
-@dataclass(frozen=True)
-class Measure:
-    """What a column's name says of it."""
-
-    higher_is_better: bool
-    tolerance: float
-    """Share that a value may change by where no spread is known."""
-    timed: bool
-    """Whether it depends on the machine's speed."""
-
-
-TIME, RATE = Measure(False, 0.15, True), Measure(True, 0.15, True)
-ERROR, ACCURACY, MEMORY = Measure(False, 0.05, False), Measure(True, 0.05, False), Measure(False, 0.05, False)
-
-RULES: tuple[tuple[str, Measure | None], ...] = (
-    (r"\bpaper|\b(in|for) this\b", None),
-    (r"faster|speed-?up|efficiency|^times |(^| )x$|^ratio (wall|cpu|device)$", RATE),
-    (r"^(ours|in order) / |/ ours$|/ raw,|^of tree$", RATE),
-    (r"^(mitsuba|embree|blender|warp|tree|raw|traced|without)\b", None),  # peers and baselines: not ours to be slower
-    (r"/ ?((wall|cpu) )?s$|\ba minute$", RATE),
-    (r"\bagree|\bPSNR\b", ACCURACY),
-    (r"\bequal time$|\b(time|cost|paths) / baseline$", TIME),
-    (r"\bequal samples$|/ baseline$|MSE\b|\b(bad|black) pixels\b|\bFLIP\b|\berrors?\b|\bwrong\b|\bbias\b", ERROR),
-    (r"\buntil settled$|^dark / lit$|^peak / settled$", ERROR),
-    (r"^(exponent|growth)\b", TIME),
-    (r"\b(bytes|[kKMG]i?B)\b", MEMORY),
-    (r"(^|[ (])(ns|us|µs|ms|s|seconds|minutes)($|[ ,)])", TIME),
-)
-"""The first that is found in a column's name tells; a column without a rule is neither better nor worse."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +44,7 @@ class Difference:
     worse: list[Change] = field(default_factory=list)
     better: list[Change] = field(default_factory=list)
     changed: list[Change] = field(default_factory=list)
-    """By name neither better nor worse."""
+    """Changes in columns of which neither lower nor higher is better."""
     only_old: list[tuple[Identity, str]] = field(default_factory=list)
     """Rows, and columns of rows in both; the column of a whole row is empty."""
     only_new: list[tuple[Identity, str]] = field(default_factory=list)
@@ -93,28 +53,17 @@ class Difference:
     """Times and rates not compared, as their rows are of different machines."""
 
 
-def measure_of(column: str) -> Measure | None:
-    """Return what is better of a column's values, or None if its name does not say."""
-    return next((measure for pattern, measure in RULES if re.search(pattern, column)), None)
-
-
 def identity_of(row: records.Row) -> Identity:
-    """Return what a row is of: suite, quick or full, words, yes and no, and settings."""
-    left_out = {*ENVIRONMENT, *REMARKS} - {"quick"}
-    return tuple(sorted((k, v) for k, v in row.items() if k not in left_out and _names(k, v)))
-
-
-def _names(key: str, value: Any) -> bool:
-    if isinstance(value, str):
-        return not SERIES.fullmatch(value.strip())
-    return isinstance(value, bool) or (key in SETTINGS and records.is_number(value))
+    """Return what a row is of: its suite, whether it is a quick run, and the values of its suite's keys."""
+    columns = catalogue.columns_of(str(row.get("suite", "")))
+    kept = [(name, value) for name, value in records.measured(row).items() if columns.is_key(name, value)]
+    return tuple(sorted([*kept, *((name, row[name]) for name in ("suite", "table", "quick") if name in row)]))
 
 
 def compare(old: Iterable[records.Row], new: Iterable[records.Row], tolerance: float | None = None) -> Difference:
     """Return what changed; of several rows of one identity the last one's values count.
 
-    ``tolerance`` is the share that values without a known spread may change by; None takes 0.15 for times and
-    rates and 0.05 for errors and memory.
+    ``tolerance`` is the share that values without a known spread may change by; None takes that of the column's kind.
     """
     before, after = _by_identity(old), _by_identity(new)
     found = Difference()
@@ -136,37 +85,42 @@ def _by_identity(rows: Iterable[records.Row]) -> dict[Identity, records.Row]:
     return found
 
 
-def _numbers(row: records.Row) -> dict[str, float]:
-    left_out = {*SETTINGS, *ENVIRONMENT, *REMARKS, *(f"{key} {spread}" for key in row for spread in SPREADS)}
-    return {key: value for key, value in row.items() if records.is_number(value) and key not in left_out}
+def _numbers(row: records.Row, columns: Columns) -> dict[str, float]:
+    """Return the values that are compared, by column: of kinds with a tolerance, and of columns not declared."""
+    found = {}
+    for name, value in records.measured(row).items():
+        column = columns.get(name)
+        is_compared = column is None or column.kind.tolerance is not None
+        if is_compared and records.is_number(value) and not columns.is_spread(name):
+            found[name] = value
+    return found
 
 
 def _compare_rows(found: Difference, identity: Identity, old: records.Row, new: records.Row, tolerance: Any) -> None:
-    before, after = _numbers(old), _numbers(new)
-    found.only_old += [(identity, column) for column in before if column not in after]
-    found.only_new += [(identity, column) for column in after if column not in before]
+    columns = catalogue.columns_of(str(old.get("suite", "")))
+    before, after = _numbers(old, columns), _numbers(new, columns)
+    found.only_old += [(identity, name) for name in before if name not in after]
+    found.only_new += [(identity, name) for name in after if name not in before]
     same_machine = all(old.get(key) == new.get(key) for key in MACHINE)
     is_others = "paper" in str(old.get("table", "")).lower() or str(old.get("renderer", "")).startswith(PEERS)
-    for column in (column for column in before if column in after):
-        measure = None if is_others else measure_of(column)
-        if measure and measure.timed and not same_machine:
+    for name in (name for name in before if name in after):
+        column = columns.get(name) or Column(name, "", None, COUNT)
+        if column.kind.is_timed and not same_machine:
             found.void += 1
             continue
-        change = Change(identity, column, before[column], after[column], _limit(column, old, new, measure, tolerance))
+        change = Change(identity, name, before[name], after[name], _limit(column, name, old, new, tolerance))
         if _exceeds(change):
-            _list_of(found, change, measure).append(change)
+            _list_of(found, change, None if is_others else column.better).append(change)
 
 
-def _limit(column: str, old: records.Row, new: records.Row, measure: Measure | None, tolerance: Any) -> float:
+def _limit(column: Column, name: str, old: records.Row, new: records.Row, tolerance: Any) -> float:
     """Return the change that is within the spread: what both spreads allow, or a share of the old value."""
-    spreads = [
-        [row[f"{column} {s}"] for s in SPREADS if records.is_number(row.get(f"{column} {s}"))] for row in (old, new)
-    ]
-    usual = measure.tolerance if measure else ERROR.tolerance
+    spreads = [[row[f"{name} {s}"] for s in SPREADS if records.is_number(row.get(f"{name} {s}"))] for row in (old, new)]
+    usual = column.kind.tolerance
     if all(spreads):
         least = usual if old.get("quick") else LEAST_SHARE
-        return max(SPREADS_APART * (abs(spreads[0][0]) + abs(spreads[1][0])), least * abs(old[column]))
-    return (usual if tolerance is None else tolerance) * abs(old[column])
+        return max(SPREADS_APART * (abs(spreads[0][0]) + abs(spreads[1][0])), least * abs(old[name]))
+    return (usual if tolerance is None else tolerance) * abs(old[name])
 
 
 def _exceeds(change: Change) -> bool:
@@ -175,12 +129,12 @@ def _exceeds(change: Change) -> bool:
     return abs(change.new - change.old) > change.limit * (1 + 1e-9)
 
 
-def _list_of(found: Difference, change: Change, measure: Measure | None) -> list[Change]:
-    if measure is None:
+def _list_of(found: Difference, change: Change, better: str | None) -> list[Change]:
+    if better is None:
         return found.changed
     if math.isfinite(change.old) != math.isfinite(change.new):
         return found.better if math.isfinite(change.new) else found.worse
-    return found.better if (change.new > change.old) == measure.higher_is_better else found.worse
+    return found.better if (change.new > change.old) == (better == "higher") else found.worse
 
 
 # ---- printing ----
@@ -199,7 +153,12 @@ def diff_files(old: Path, new: Path, tolerance: float | None = None) -> int:
     if not found.matched:
         hint = f" ({notes[-1]})" if any(note.startswith("quick") for note in notes) else ""
         raise OptionError(f"no row of {new} is in {old}, so nothing can be compared{hint}")
-    for note in [*notes, *_skip_notes("OLD", before), *_skip_notes("NEW", after)]:
+    for note in [
+        *notes,
+        *_undeclared_notes([*before, *after]),
+        *_skip_notes("OLD", before),
+        *_skip_notes("NEW", after),
+    ]:
         print(note)
     if found.void:
         print(f"the machines differ: {found.void} times and rates are not compared")
@@ -208,7 +167,7 @@ def diff_files(old: Path, new: Path, tolerance: float | None = None) -> int:
     _print_only(found)
     if found.changed:
         columns = ", ".join(sorted({change.column for change in found.changed}))
-        print(f"\nchanged, by name neither better nor worse: {len(found.changed)} values of {columns}")
+        print(f"\nchanged, neither better nor worse: {len(found.changed)} values of {columns}")
     print(f"\n{found.matched} rows compared: {len(found.worse)} values worse, {len(found.better)} better")
     return int(bool(found.worse))
 
@@ -222,6 +181,16 @@ def _environment_notes(old: list[records.Row], new: list[records.Row]) -> list[s
                 notes.append("quick and full runs measure different inputs: their rows are not matched")
             else:
                 notes.append(f"{key}: {', '.join(before) or 'not said'} -> {', '.join(after) or 'not said'}")
+    return notes
+
+
+def _undeclared_notes(rows: list[records.Row]) -> list[str]:
+    """Return a note for each suite with columns that it does not declare: older or newer ones, or another program's."""
+    notes = []
+    for suite in dict.fromkeys(str(row.get("suite", "")) for row in rows):
+        of_suite = (records.measured(row) for row in rows if str(row.get("suite", "")) == suite)
+        if names := catalogue.columns_of(suite).undeclared(of_suite):
+            notes.append(f"suite {suite!r} declares no columns {', '.join(names)}: nobody knows what is better of them")
     return notes
 
 

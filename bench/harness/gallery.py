@@ -30,7 +30,7 @@ class PictureSet:
     images: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Linear radiance by estimator, each of the reference's shape. May hold NaN and infinities, which are shown."""
     suite: str = ""
-    """In whose section of the report they stand."""
+    """The suite in whose section of the report they stand."""
     note: str = ""
     """What was done to them after rendering."""
 

@@ -40,7 +40,7 @@ class Taken(Generic[T]):
     wall: list[float] = field(default_factory=list)
     cpu: list[float] = field(default_factory=list)
     device: list[float] = field(default_factory=list)
-    """By events on a CUDA device; empty on the CPU."""
+    """Seconds by events on a CUDA device; empty on the CPU."""
     results: list[T] = field(default_factory=list)
 
     @property
@@ -214,6 +214,15 @@ def peak_memory() -> float:
         return 1024.0 * int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1])
     except (OSError, StopIteration):  # not Linux; a fork's getrusage may count its parent, which VmHWM does not
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0)
+
+
+def resident_memory() -> float:
+    """Return the bytes of memory that this process has resident; the most it has had where that is not known."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        return float(pages * os.sysconf("SC_PAGE_SIZE"))
+    except OSError:
+        return peak_memory()
 
 
 def _forget_peak() -> bool:

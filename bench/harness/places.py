@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import warp_gi as gi
-from warp_gi.bench.harness import presets
+from warp_gi.bench.harness import scenes
 
 Color = tuple[float, float, float]
 Point = tuple[float, float, float]
@@ -22,17 +22,17 @@ class Place:
 
     title: str
     source: str | Callable[[], gi.Scene]
-    """A file of `presets.SCENES`, the name of a built-in scene, or what builds one."""
+    """A file of `scenes.SCENES`, the name of a built-in scene, or what builds one."""
     view: gi.CameraPath | str = ""
     """Where it is seen from, and at which size: a path, or the name of a camera of the built-in scene; its own path."""
     environment: Color | str | None = None
-    """Radiance of a constant sky, or a file of `presets.SCENES`; None leaves the scene what it has itself."""
+    """Radiance of a constant sky, or a file of `scenes.SCENES`; None leaves the scene what it has itself."""
     reads: tuple[str, ...] = ()
-    """Files of `presets.SCENES` that ``source`` builds of."""
+    """Files of `scenes.SCENES` that ``source`` builds of."""
 
     @property
     def files(self) -> tuple[str, ...]:
-        """What has to be in `presets.SCENES`, geometry first."""
+        """What has to be in `scenes.SCENES`, geometry first."""
         files = [*self.reads]
         if isinstance(self.source, str) and "." in self.source:
             files.append(self.source)
@@ -50,11 +50,11 @@ class Place:
         if not isinstance(self.source, str):
             scene = self.source()
         elif "." in self.source:
-            scene = gi.load_scene(presets.SCENES / self.source)
+            scene = gi.load_scene(scenes.SCENES / self.source)
         else:
             scene = gi.builtin_scene(self.source)
         if isinstance(self.environment, str):
-            scene.environment = presets.SCENES / self.environment
+            scene.environment = scenes.SCENES / self.environment
         elif self.environment is not None:
             scene.environment = self.environment
         return scene
@@ -73,8 +73,8 @@ class Place:
 
 
 def missing(files: Iterable[str]) -> str:
-    """Return what to say if some of these are not in `presets.SCENES`, or nothing."""
-    absent = ", ".join(str(presets.SCENES / name) for name in files if not (presets.SCENES / name).exists())
+    """Return what to say if some of these are not in `scenes.SCENES`, or nothing."""
+    absent = ", ".join(str(scenes.SCENES / name) for name in files if not (scenes.SCENES / name).exists())
     return f"no {absent}; set WARP_GI_SCENES to the folder of the scene files" if absent else ""
 
 
@@ -112,24 +112,22 @@ PLACES: dict[str, Place] = {
     "two_rooms_dark": Place("two rooms, the dark one", "two_rooms", _still((3.7, 1.7, 1.8), (1.2, 0.9, -1.2), 75.0)),
     "warehouse": Place("warehouse", "warehouse"),
     # built here
-    "cylinders": Place("cylinders", presets.cylinder_box, _still((0, 8.5, 0.01), (0, 0, 0), 42.0, (540, 540))),
-    "guiding_ring": Place("guiding_ring", presets.guiding_ring, _still((0, 6, 0.01), (0, 0, 0), 26.0, (540, 540))),
-    "spheres": Place("spheres, lamp", presets.spheres, _ROW, (0.2, 0.3, 0.5)),
-    "spheres_interior": Place("spheres, interior sky", presets.spheres, _ROW, INTERIOR),
-    "strobe": Place("strobe", presets.strobe, _still((-1.5, 1.6, 2.8), (0.3, 0.9, -1.0), 75.0)),
+    "cylinders": Place("cylinders", scenes.cylinder_box, _still((0, 8.5, 0.01), (0, 0, 0), 42.0, (540, 540))),
+    "guiding_ring": Place("guiding_ring", scenes.guiding_ring, _still((0, 6, 0.01), (0, 0, 0), 26.0, (540, 540))),
+    "spheres": Place("spheres, lamp", scenes.spheres, _ROW, (0.2, 0.3, 0.5)),
+    "spheres_interior": Place("spheres, interior sky", scenes.spheres, _ROW, INTERIOR),
+    "strobe": Place("strobe", scenes.strobe, _still((-1.5, 1.6, 2.8), (0.3, 0.9, -1.0), 75.0)),
     # of files
     "bistro": Place("Bistro", _BISTRO, _ROOFS),
     "bistro_white": Place("Bistro, white sky", _BISTRO, _ROOFS, WHITE),
     "bistro_wide": Place("Bistro, white sky, 65 degrees", _BISTRO, _still((-40, 45, -60), (-10, 0, -10), 65.0), WHITE),
     "dragon": Place(
-        "dragon", presets.covered_dragon, _still((0.6, 1.3, 2.7), (0.0, 0.7, 0.0), 60.0), reads=(presets.DRAGON,)
+        "dragon", scenes.covered_dragon, _still((0.6, 1.3, 2.7), (0.0, 0.7, 0.0), 60.0), reads=(scenes.DRAGON,)
     ),
-    "dragon_white": Place(
-        "dragon, white sky", presets.DRAGON, _still((0.0, 0.15, 0.45), (0.0, 0.12, 0.0), 30.0), WHITE
-    ),
-    "living_room": Place("living room", presets.lit_room, _WINDOWS, reads=(presets.LIVING_ROOM,)),
-    "living_room_all": Place("living room, all", presets.lit_room, _INTO_THE_ROOM, reads=(presets.LIVING_ROOM,)),
-    "living_room_white": Place("living room, white sky", presets.LIVING_ROOM, _WINDOWS, WHITE),
+    "dragon_white": Place("dragon, white sky", scenes.DRAGON, _still((0.0, 0.15, 0.45), (0.0, 0.12, 0.0), 30.0), WHITE),
+    "living_room": Place("living room", scenes.lit_room, _WINDOWS, reads=(scenes.LIVING_ROOM,)),
+    "living_room_all": Place("living room, all", scenes.lit_room, _INTO_THE_ROOM, reads=(scenes.LIVING_ROOM,)),
+    "living_room_white": Place("living room, white sky", scenes.LIVING_ROOM, _WINDOWS, WHITE),
     "modern_hall": Place("modern hall", "modern_hall.glb", _still((4, 1.7, 2), (-3, 1.6, -0.5), 60.0)),
     "sponza": Place("Sponza", _SPONZA, _NAVE, WHITE),
     "sponza_courtyard": Place("Sponza, courtyard sky", _SPONZA, _NAVE, COURTYARD),
@@ -139,4 +137,4 @@ PLACES: dict[str, Place] = {
     "sponza_gallery": Place("Sponza, gallery", _SPONZA, _GALLERY, WHITE),
     "sponza_gallery_courtyard": Place("Sponza, gallery, courtyard sky", _SPONZA, _GALLERY, COURTYARD),
 }
-"""By key. Suites name keys, and add what is theirs: targets, settings of estimators, depths, sizes."""
+"""Places by key. Suites name keys, and add what is theirs: targets, settings of estimators, depths, sizes."""

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from warp_gi.bench.harness.runner import ENVIRONMENT
 from warp_gi.errors import OptionError
 
 Row = dict[str, Any]
+PACKAGES = ("warp-lang", "numpy", "mitsuba", "embreex", "pyoidn", "OpenImageIO", "bpy")
+ENVIRONMENT = ("quick", "commit", "warp_gi", "python", *PACKAGES, "cpu", "cores", "threads", "device")
+"""Keys of a line of results that say how it was measured."""
+SERIES = re.compile(r"[-+.\deE]+(\s+[-+.\deE]+)+")
+"""Numbers in words: a series over frames."""
 MACHINE = ("cpu", "cores", "threads", "device", "quick")
 """What must be the same of figures that stand in one table; commits and versions may differ from part to part."""
 
@@ -104,7 +109,7 @@ def machines_apart(rows: Iterable[Row]) -> list[Row]:
     parted = []
     for row in rows:
         found = known[suite := str(row.get("suite", ""))]
-        where = f"machine {found.index(_machine(row)) + 1}"
+        where = f"machine {found.index(_machine(row)) + 1}"  # see catalogue.MACHINE_SEPARATOR
         parted.append(row | {"suite": f"{suite}, {where}" if suite else where} if len(found) > 1 else row)
     return parted
 

@@ -1,15 +1,12 @@
-"""Finds and runs benchmark suites, prints their rows as tables and writes them as lines of JSON.
+"""Runs benchmark suites and writes their rows as lines of JSON.
 
-A suite is a module of ``suites``, or the module ``suite`` of a folder there, with
-``run(quick: bool, device: str) -> list[dict]``;
-its first docstring line says what it measures. Rows with the same keys make one table. One whose ``run`` also takes
+A suite is a folder of ``suites`` whose ``suite.py`` has ``run(quick: bool, device: str) -> list[dict]``; see
+``catalogue`` for what else it holds. Rows with the same keys make one table. A suite whose ``run`` also takes
 ``gallery`` adds pictures to it. The last row of each is what the whole suite took.
 """
 
 from __future__ import annotations
 
-import ast
-import importlib
 import json
 import os
 import platform
@@ -22,29 +19,14 @@ from pathlib import Path
 from typing import Any
 
 from warp_gi import launch
+from warp_gi.bench.harness import catalogue, records
 from warp_gi.bench.harness.gallery import CLOSED, Gallery, call
 from warp_gi.bench.harness.measure import PeakMemory, attempt
 from warp_gi.errors import unknown_name
 from warp_gi.files import replacing
 
-FOLDER = Path(__file__).parents[1] / "suites"
-PACKAGES = ("warp-lang", "numpy", "mitsuba", "embreex", "pyoidn", "OpenImageIO", "bpy")
-ENVIRONMENT = ("quick", "commit", "warp_gi", "python", *PACKAGES, "cpu", "cores", "threads", "device")
-"""Keys of a line of results that say how it was measured."""
 WHOLE = "run"
 """Table of what a whole suite took; CPU seconds, compilation and memory are of this process alone."""
-
-
-def suites(folder: Path = FOLDER) -> dict[str, str]:
-    """Return the suites and what they measure, by name, without importing them."""
-    found = {}
-    for path in sorted([*folder.glob("*.py"), *folder.glob("*/suite.py")]):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        if any(isinstance(node, ast.FunctionDef) and node.name == "run" for node in tree.body):
-            found[path.parent.name if path.stem == "suite" else path.stem] = (ast.get_docstring(tree) or "").partition(
-                "\n"
-            )[0]
-    return found
 
 
 def run_suite(
@@ -55,11 +37,11 @@ def run_suite(
     ``parts`` are names of the suite's ``PARTS``; none are all. Raises OptionError if there is no suite or part of that
     name, or no such device.
     """
-    if name not in (known := suites()):
+    if name not in (known := catalogue.suites()):
         raise unknown_name("benchmark suite", name, known)
     launch.get_device(device)
     commit()  # of what runs, whatever is committed meanwhile
-    suite = importlib.import_module(f"warp_gi.bench.suites.{name}" + ".suite" * (FOLDER / name).is_dir())
+    suite = catalogue.module(name, "suite")
     for part in parts:
         if part not in (known_parts := getattr(suite, "PARTS", {})):
             raise unknown_name(f"part of suite {name}", part, known_parts)
@@ -67,7 +49,20 @@ def run_suite(
     wall, cpu = time.perf_counter(), time.process_time()
     rows = call(suite.run, quick, device, gallery.of(name), **({"parts": parts} if parts else {}))
     whole = {"table": WHOLE, "wall s": time.perf_counter() - wall, "cpu s": time.process_time() - cpu}
-    return [*rows, whole | {"compile s": launch.compile_seconds - compiled} | memory.row()]
+    whole |= {"compile s": launch.compile_seconds - compiled} | memory.row()
+    return [*rows, *undeclared_rows(name, rows), whole]
+
+
+def undeclared_rows(suite: str, rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return a row that has failed for each column of ``rows`` that the suite does not declare.
+
+    The measurements stay: they may have taken hours.
+    """
+    columns = catalogue.columns_of(suite)
+    return [
+        {"failed": f"column {name!r} of suite {suite!r} is not declared: add it to its columns.py"}
+        for name in columns.undeclared(map(records.measured, rows))
+    ]
 
 
 def run_all(quick: bool, device: str, gallery: Gallery = CLOSED) -> Iterator[tuple[str, list[dict[str, Any]]]]:
@@ -76,7 +71,7 @@ def run_all(quick: bool, device: str, gallery: Gallery = CLOSED) -> Iterator[tup
     Raises OptionError if there is no such device.
     """
     launch.get_device(device)
-    for name in suites():
+    for name in catalogue.suites():
         yield name, attempt({}, lambda name=name: run_suite(name, quick, device, gallery))
 
 
@@ -120,7 +115,7 @@ def environment(device: str) -> dict[str, Any]:
         "commit": commit(),
         "warp_gi": warp_gi.__version__,
         "python": platform.python_version(),
-        **{package: version for package in PACKAGES if (version := _version(package))},
+        **{package: version for package in records.PACKAGES if (version := _version(package))},
         "cpu": cpu_model(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "threads": launch.thread_count(),

@@ -11,7 +11,7 @@ from warp_gi.bench.harness.measure import Row
 from warp_gi.metrics import RELATIVE_EPSILON
 
 Pictures = Mapping[str, Sequence[np.ndarray]]
-"""By renderer, pictures with independent noise, float [height, width, 3], two or more."""
+"""Two or more pictures with independent noise, float [height, width, 3], by renderer."""
 
 
 def mean_of(pictures: Pictures) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 import warp_gi as gi
-from warp_gi.bench.harness import presets
+from warp_gi.bench.harness import scenes
 from warp_gi.bench.harness.measure import Taken, Times, take_turns, timed
 from warp_gi.bench.harness.places import PLACES
 from warp_gi.frame import TERMS
@@ -18,7 +18,7 @@ from warp_gi.frame import TERMS
 LAMBERT: Mapping[str, bool] = {"diffuse": True}
 DARK: Mapping[str, bool] = {"diffuse": True, "emission": False}
 PLAIN: Mapping[str, bool] = {"diffuse": False}
-"""Settings of `presets.peer_scene`."""
+"""Settings of `scenes.peer_scene`."""
 
 
 @dataclass(frozen=True)
@@ -28,13 +28,13 @@ class Case:
     place: str
     """Key in `PLACES`."""
     name: str = ""
-    """In rows; the place's title if not given."""
+    """Name in rows; the place's title if not given."""
     target: float = 0.0
     """How many times faster than the baseline the estimator shall be."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Of its estimator, where not the defaults."""
+    """Settings of the estimator that are not its defaults."""
     materials: Mapping[str, bool] | None = None
-    """What `presets.peer_scene` makes of them; None leaves them as they are."""
+    """Settings of `scenes.peer_scene` for the materials; None leaves them as they are."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", self.name or PLACES[self.place].title)
@@ -47,7 +47,7 @@ class Case:
     def scene(self) -> gi.Scene:
         """Return the scene with its materials as they are measured."""
         scene = PLACES[self.place].scene()
-        return scene if self.materials is None else presets.peer_scene(scene, **self.materials)
+        return scene if self.materials is None else scenes.peer_scene(scene, **self.materials)
 
     def path(self) -> gi.CameraPath:
         """Return the place's camera path."""
@@ -84,6 +84,26 @@ class Stage:
         if self.frame.paths.is_wanted:
             self.frame.trace_paths()
         wp.synchronize_device(self.frame.device)
+
+
+@dataclass
+class View:
+    """A scene from a camera on a device; bakes are made once for all settings that give the same one."""
+
+    scene: gi.Scene
+    camera: gi.Camera
+    device: str = "cpu"
+    path: gi.CameraPath | None = None
+    """Camera path that bakes are made for; None for the camera alone."""
+    bakes: dict[str, tuple[gi.Bake, Times]] = field(default_factory=dict)
+    """Bakes and their seconds, by the settings that they depend on."""
+
+    def bake(self, estimator: Any) -> tuple[gi.Bake, Times]:
+        """Return the bake and what it took, compilation apart."""
+        key = repr(estimator.bake_settings(self.scene))
+        if key not in self.bakes:
+            self.bakes[key] = timed_bake(self.scene, estimator, self.device, self.path or self.camera)
+        return self.bakes[key]
 
 
 def timed_bake(scene: gi.Scene, estimator: Any, device: str, camera: Any = None) -> tuple[gi.Bake, Times]:

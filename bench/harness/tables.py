@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from warp_gi.bench.harness import diff, markdown, records
+from warp_gi.bench.harness import catalogue, markdown, records
 from warp_gi.cli.report import cell_text, print_table
 
 Columns = dict[str, list[Any]]
@@ -37,11 +37,11 @@ def shown(table: records.Table) -> Shown:
     return Shown(f"In all rows: {said}." if said else "", columns, [n for n in names if n not in shared], numeric)
 
 
-def print_rows(title: str, rows: Sequence[records.Row]) -> None:
-    """Print rows as tables, one for each set of keys, under ``title`` and the name of the table."""
-    for table in records.tables_of(rows):
+def print_rows(suite: str, rows: Sequence[records.Row], is_titled: bool = True) -> None:
+    """Print rows of a suite as tables, one for each set of keys, under the names of suite and table."""
+    for table in records.tables_of({**row, "suite": suite} for row in rows):
         one = shown(table)
-        head = ": ".join(text for text in (title, table.name) if text)
+        head = ": ".join(text for text in (suite * is_titled, table.name) if text)
         places = [place for place, column in enumerate(one.columns) if column in one.names]
         body = list(zip(*one.columns.values(), strict=True))
         print_table(f"{head}\n{one.said}" if one.said else head, list(one.columns), body, places)
@@ -49,8 +49,10 @@ def print_rows(title: str, rows: Sequence[records.Row]) -> None:
 
 def _identity(table: records.Table) -> list[str]:
     """Return the columns that tell what a row is of."""
-    found = {key for row in table.rows for key, _ in diff.identity_of(dict(zip(table.columns, row, strict=True)))}
-    return [name for name in table.columns if name in found] or list(table.columns[:1])
+    columns = catalogue.columns_of(table.suite)
+    values = zip(table.columns, zip(*table.rows, strict=True), strict=True)
+    found = [name for name, given in values if any(columns.is_key(name, value) for value in given)]
+    return found or list(table.columns[:1])
 
 
 def _with_spreads(columns: Columns) -> Columns:
@@ -71,7 +73,7 @@ def _with_spread(value: Any, spread: Any) -> Any:
 
 def _short(value: Any) -> Any:
     """Return a value, or of a series of numbers in words the first, the last and the count."""
-    if isinstance(value, str) and diff.SERIES.fullmatch(value.strip()):
+    if isinstance(value, str) and records.SERIES.fullmatch(value.strip()):
         series = value.split()
         return f"{series[0]} … {series[-1]} ({len(series)})"
     return value

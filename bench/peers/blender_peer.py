@@ -21,7 +21,7 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi import launch, metrics
-from warp_gi.bench.harness import presets
+from warp_gi.bench.harness import scenes
 from warp_gi.bench.harness.measure import Row
 from warp_gi.bench.harness.places import PLACES, WHITE
 from warp_gi.sequence.exr import read_exr
@@ -72,7 +72,7 @@ def is_installed() -> bool:
 
 def compare(job: Job, folder: Path) -> Row:
     """Render the sequence by both; raises CalledProcessError if one fails."""
-    scene = presets.peer_scene(PLACES[job.scene].scene(), diffuse=True, masks=False)
+    scene = scenes.peer_scene(PLACES[job.scene].scene(), diffuse=True, masks=False)
     path = PLACES[job.scene].path().at_resolution(*job.size)
     write_glb(scene, folder / "scene.glb")
     path.save(folder / "camera.json")

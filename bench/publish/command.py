@@ -1,8 +1,9 @@
-"""Writes what the documents say of measurements: ``docs/results.md``, and the marked regions of ``README.md``.
+"""Writes what the documents say of measurements: ``docs/results.md``, and marked regions of the other documents.
 
-``python -m warp_gi.bench.publish [--check]``. All of it comes from ``bench/results/*.jsonl``. A region of the README
-stands between ``<!-- results: NAME -->`` and ``<!-- end -->``; ``publish_regions.REGIONS`` says what goes there.
-``--check`` writes nothing, and leaves with exit code 1 if a file is not what it would write.
+``python -m warp_gi.bench.publish [--check]``. All of it comes from ``bench/results/*.jsonl``. A region of ``README.md``
+or of a page of ``docs/`` stands between ``<!-- results: NAME -->`` and ``<!-- end -->``. NAME is ``headlines``, a table
+of the techniques, or a region that a suite's folder has in its ``regions.py``. ``--check`` writes nothing, and leaves
+with exit code 1 if a file is not what it would write.
 """
 
 from __future__ import annotations
@@ -10,51 +11,81 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 
-from warp_gi.bench.harness import records, runner
-from warp_gi.bench.publish.figures import region_text
+from warp_gi.bench.harness import catalogue, records
+from warp_gi.bench.harness.catalogue import ROOT
+from warp_gi.bench.publish.figures import Headline, Region, headlines_text, region_text
 from warp_gi.bench.publish.page import page
-from warp_gi.bench.publish.regions import REGIONS
 from warp_gi.errors import GiError, OptionError, unknown_name
 from warp_gi.files import replacing
 
-ROOT = runner.FOLDER.parent
-PAGE, README = Path("docs/results.md"), Path("README.md")
+PAGE, README, PAGES = Path("docs/results.md"), Path("README.md"), "docs/**/*.md"
+RESULTS = "bench/results"
 DEVICE = "cpu"
-"""Of the figures in the README; the page has all."""
+"""Device whose figures regions show; the tables of the page have all devices."""
+HEADLINES = "headlines"
 REGION = re.compile(r"(<!-- results: (?P<name>[^\n]*?) -->\n)(?P<text>.*?)(?P<end><!-- end -->|\Z)", re.DOTALL)
 
 
-def readme(text: str, rows: Sequence[records.Row]) -> str:
-    """Return the README's text with its regions made anew; raises OptionError for marks that cannot be filled."""
+@lru_cache
+def regions() -> dict[str, Region]:
+    """Return the regions of all suites' folders, by name; raises OptionError for a name that two of them have."""
+    found: dict[str, Region] = {}
+    for suite, module in catalogue.modules("regions"):
+        for name, region in module.REGIONS.items():
+            if name in found or name == HEADLINES:
+                raise OptionError(f"regions.py of suite {suite!r}: another region has the name {name!r}")
+            found[name] = region
+    return found
 
-    def filled(match: re.Match[str]) -> str:
+
+@lru_cache
+def headlines() -> tuple[Headline, ...]:
+    """Return the lines of the table of techniques."""
+    return tuple(line for _, module in catalogue.modules("regions") for line in getattr(module, "HEADLINES", ()))
+
+
+def filled(path: Path, text: str, texts: Mapping[str, str]) -> str:
+    """Return a document's text with its regions made anew; raises OptionError for marks that cannot be filled."""
+
+    def fill(match: re.Match[str]) -> str:
         name = match["name"]
         if not match["end"] or "<!-- results:" in match["text"]:
-            raise OptionError(f"README: <!-- results: {name} --> has no <!-- end -->")
-        if name not in REGIONS:
-            raise unknown_name("region of results", name, REGIONS)
-        return f"{match[1]}{region_text(name, REGIONS[name], rows)}\n{match['end']}"
+            raise OptionError(f"{path}: <!-- results: {name} --> has no <!-- end -->")
+        if name not in texts:
+            raise unknown_name(f"region of results in {path}:", name, texts)
+        return f"{match[1]}{texts[name]}\n{match['end']}"
 
-    return REGION.sub(filled, text)
+    return REGION.sub(fill, text)
+
+
+def texts_of(rows: Sequence[records.Row]) -> dict[str, str]:
+    """Return the texts of regions whose suites have results, by name; raises OptionError for a figure without value."""
+    known = {row.get("suite") for row in rows}
+    texts = {name: region_text(name, region, rows) for name, region in regions().items() if region.suite in known}
+    return texts | {HEADLINES: headlines_text([one for one in headlines() if one.columns.suite in known], rows)}
 
 
 def pages(root: Path) -> dict[Path, str]:
     """Return what the documents under ``root`` should say; raises OSError or OptionError where results are missing."""
-    files = sorted((root / "bench/results").glob("*.jsonl"))
+    files = sorted((root / RESULTS).glob("*.jsonl"))
     if not files:
-        raise OptionError(f"{root / 'bench/results'}: no *.jsonl there; `warp-gi bench SUITE --json FILE` writes them")
+        raise OptionError(f"{root / RESULTS}: no *.jsonl there; `warp-gi bench SUITE --json FILE` writes them")
     rows = records.read(files)
     for suite, found in records.environments(rows).items():
         if len({one.get("quick", False) for one in found}) > 1:
-            raise OptionError(f"{root / 'bench/results'}: quick and full runs of suite {suite!r}; keep the full ones")
+            raise OptionError(f"{root / RESULTS}: quick and full runs of suite {suite!r}; keep the full ones")
         on_cpu = {(one.get("cpu"), one.get("threads")) for one in found if one.get("device") == DEVICE}
         if len(on_cpu) > 1:
-            raise OptionError(f"{root / 'bench/results'}: suite {suite!r} ran on several processors; keep one's")
-    told = [row for row in rows if row.get("device", DEVICE) == DEVICE]
-    return {PAGE: page(rows), README: readme((root / README).read_text(encoding="utf-8"), told)}
+            raise OptionError(f"{root / RESULTS}: suite {suite!r} ran on several processors; keep one's")
+    texts = texts_of([row for row in rows if row.get("device", DEVICE) == DEVICE])
+    others = [path.relative_to(root) for path in sorted(root.glob(PAGES)) if path != root / PAGE]
+    short = {name: (regions()[name].introduction, text) for name, text in texts.items() if name != HEADLINES}
+    found = {path: filled(path, (root / path).read_text(encoding="utf-8"), texts) for path in (README, *others)}
+    return {PAGE: page(rows, short), **found}
 
 
 def publish(root: Path, check: bool = False) -> list[Path]:

@@ -19,7 +19,7 @@ LEFT, RIGHT, TOP, BOTTOM = 66, 14, 12, 50
 """Margins of the axes."""
 STYLES = 8
 LOG_STEPS = ((1,), (1, 2, 5), (1, 2, 3, 5, 7), (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9))
-"""What to label of each decade, from few to many."""
+"""Numbers to label in each decade, from few to many."""
 DASHES = ("", "7 4", "2 3", "9 3 2 3")
 MARKERS = (
     "M-4 0a4 4 0 1 0 8 0a4 4 0 1 0 -8 0z",
@@ -44,7 +44,7 @@ class Plot:
     fit: bool = False
     """Fit y = a x^k to each series, draw it dotted and tell k; needs both axes logarithmic."""
     suite: str = ""
-    """In whose section of the report it stands."""
+    """The suite in whose section of the report it stands."""
 
     def validate(self) -> None:
         """Raise OptionError unless x and y of each series have the same length, and axes are logarithmic for a fit."""

@@ -7,8 +7,9 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from typing import Any
 
-from warp_gi.bench.harness import markdown, records
-from warp_gi.bench.harness.diff import SERIES, SPREADS
+from warp_gi.bench.harness import catalogue, markdown, records
+from warp_gi.bench.harness.columns import SPREADS, Column
+from warp_gi.bench.harness.records import SERIES
 from warp_gi.cli.report import cell_text
 
 LONGEST = 30
@@ -62,7 +63,8 @@ def table_html(table: records.Table) -> str:
     spreads = _spread_columns(table.columns)
     shown = [index for index in range(len(table.columns)) if index not in spreads.values()]
     numeric = {index: any(records.is_number(row[index]) for row in table.rows) for index in shown}
-    head = "".join(_header(table.columns[index], numeric[index]) for index in shown)
+    columns = catalogue.columns_of(table.suite)
+    head = "".join(_header(table.columns[i], columns.get(table.columns[i]), numeric[i]) for i in shown)
     body = ""
     for row in table.rows:
         cells = (
@@ -89,9 +91,11 @@ def _spread_columns(columns: Sequence[str]) -> dict[int, int]:
     }
 
 
-def _header(column: str, is_number: bool) -> str:
+def _header(name: str, column: Column | None, is_number: bool) -> str:
+    """Return a column's head, which says unit and what is better when pointed at."""
     align = ' class="number"' if is_number else ""
-    return f'<th scope="col"{align}><button type="button">{escape(column)}</button></th>'
+    title = f' title="{escape(column.said)}"' if column is not None and column.said else ""
+    return f'<th scope="col"{align}{title}><button type="button">{escape(name)}</button></th>'
 
 
 def _cell(value: Any, spread: Any, is_number: bool, is_first: bool) -> str:

@@ -1,1 +1,1 @@
-"""The benchmark suites, one module or folder each."""
+"""The benchmark suites, one folder each; what a folder may hold is in ``warp_gi.bench.harness.catalogue``."""

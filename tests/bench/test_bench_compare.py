@@ -11,6 +11,7 @@ import warp_gi as gi
 from warp_gi import metrics
 from warp_gi.bench.compare import rows as compare_rows
 from warp_gi.bench.compare import run as compare
+from warp_gi.bench.compare.columns import COLUMNS
 from warp_gi.bench.compare.reference import Reference, StillFrames, computed, from_file
 from warp_gi.bench.compare.run import Point, Run, seconds_to
 from warp_gi.bench.compare.setup import baked
@@ -219,6 +220,7 @@ def test_the_command_writes_tables_plots_and_pictures(tmp_path, capsys):
     assert cli.main(["bench", "compare", *arguments, "--html", str(page), "--json", str(lines)]) == 0
     printed = capsys.readouterr().out
     rows = records.read([lines])
+    assert COLUMNS.undeclared(map(records.measured, rows)) == []
     tables = {name: [row for row in rows if row["table"] == name] for name in {row["table"] for row in rows}}
     for name in ("setup", "frames", "equal samples", "equal time", "equal error"):
         assert {row["pipeline"] for row in tables[name]} == {"path", "direct"}, name

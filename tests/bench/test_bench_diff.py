@@ -7,10 +7,27 @@ import math
 
 import pytest
 
-from warp_gi.bench.harness import diff
+from warp_gi.bench.harness import catalogue, columns, diff
 from warp_gi.cli import main as cli
 
+COLUMNS = columns.columns(
+    "s",
+    columns.keys("case", "mode", "spp", "masks", "renderer"),
+    columns.notes("target", "by frame"),
+    columns.measured(columns.TIME, "ms", "lower", "ms"),
+    columns.measured(columns.TIME, "s", None, "mitsuba wall s"),
+    columns.measured(columns.RATE, "Mrays/s", "higher", "Mrays/s"),
+    columns.measured(columns.ERROR, "", "lower", "RMSE"),
+    columns.measured(columns.ERROR, "share", "higher", "agree"),
+    columns.measured(columns.COUNT, "leaves", None, "leaves"),
+    columns.measured(columns.MEMORY, "MB", "lower", "MB"),
+)
 HOME = {"suite": "s", "quick": False, "commit": "a", "cpu": "One", "cores": 2, "threads": 2, "device": "cpu"}
+
+
+@pytest.fixture(autouse=True)
+def columns_of_s(monkeypatch):
+    monkeypatch.setattr(catalogue, "columns_of", lambda suite: COLUMNS if suite == "s" else columns.Columns(suite))
 
 
 def row(**values):
@@ -19,23 +36,6 @@ def row(**values):
 
 def names(changes):
     return [change.column for change in changes]
-
-
-LOWER = """wall s | paths ms | seconds | ns a pixel | wall s to 0.01 | MSE beauty | ours relMSE | RMSE | ST FLIP
-    | error ratio | bytes a triangle | KB | peak GB | beauty / baseline | beauty, equal time | wrong per million
-    | bad pixels | black pixels | device s | RMSE at equal time | object kB | frames until settled | dark / lit"""
-HIGHER = """Mrays/s | Mrays/wall s | faster, cpu | speed-up | x | faster at equal error, cpu | agree | ratio cpu
-    | ours frames a minute | ratio device | bake / raw, cpu | of tree
-    | embree / ours | ours / embree | times mitsuba, wall"""
-NEITHER = """blender frames a minute | mitsuba wall s | embree Mrays/s | paper's method, ratio cpu | leaves
-    | paths spp for this RMSE | samples"""
-
-
-@pytest.mark.parametrize("columns, higher", [(LOWER, False), (HIGHER, True), (NEITHER, None)])
-def test_names_say_what_is_better(columns, higher):
-    measures = {column.strip(): diff.measure_of(column.strip()) for column in columns.split("|")}
-    said = {column: measure and measure.higher_is_better for column, measure in measures.items()}
-    assert said == dict.fromkeys(measures, higher)
 
 
 @pytest.mark.parametrize("key, value", [("case", "d"), ("mode", "m"), ("spp", 4), ("masks", True), ("quick", True)])
@@ -119,6 +119,20 @@ def test_times_of_another_machine_are_void_but_errors_are_not():
     assert len(diff.compare([old], [new]).worse) == 3
 
 
+def test_times_of_other_renderers_are_void_too():
+    found = diff.compare([row(**{"mitsuba wall s": 1.0})], [row(**{"mitsuba wall s": 2.0}) | {"cpu": "Two"}])
+    assert found.void == 1 and found.changed == []
+
+
+def test_a_column_that_is_not_declared_is_neither_better_nor_worse_and_is_told(tmp_path, capsys):
+    old, new = row(**{"old times": 1.0, "way": "a", "series": "1 2 3"}), row(**{"old times": 2.0, "way": "a"})
+    found = diff.compare([old], [new])
+    assert (found.matched, names(found.changed), found.worse) == (1, ["old times"], [])
+    assert diff.compare([old], [new | {"way": "b"}]).matched == 0  # words tell rows apart
+    code, printed = run(tmp_path, capsys, [old], [new])
+    assert code == 0 and "suite 's' declares no columns old times, way, series" in printed
+
+
 def test_the_papers_figures_are_never_worse():
     quoted = {"table": "times: paper, RTX 3080"}
     found = diff.compare([row(ms=1.0, **quoted)], [row(ms=2.0, **quoted)])
@@ -156,7 +170,7 @@ def test_three_tables_and_exit_code_1(tmp_path, capsys):
     assert better < printed.index("s t: c RMSE 1 0.5 -50.0% 5.0%") < only
     for text in ("OLD s t: gone all", "NEW s t: come all", "NEW s t: c MB"):
         assert printed.index(text) > only
-    assert "commit: a -> b" in printed and "neither better nor worse: 1 values of leaves" in printed
+    assert "commit: a -> b" in printed and "changed, neither better nor worse: 1 values of leaves" in printed
     assert "1 rows compared: 1 values worse, 1 better" in printed
 
 

@@ -10,10 +10,10 @@ import warp as wp
 
 import warp_gi as gi
 from warp_gi import launch, metrics
-from warp_gi.bench.harness import gallery, measure, presets, scatter
+from warp_gi.bench.harness import gallery, measure, scatter, scenes
 from warp_gi.bench.harness.places import PLACES
 from warp_gi.bench.peers import mitsuba_peer
-from warp_gi.bench.suites import path
+from warp_gi.bench.suites.path import suite as path
 
 # ---- time ----
 
@@ -144,7 +144,7 @@ def test_renderers_are_compared_at_equal_samples_time_and_error():
 
 
 def test_mitsuba_is_the_same_in_both_variants():
-    scene = presets.peer_scene(gi.builtin_scene("cornell_box"), diffuse=True)
+    scene = scenes.peer_scene(gi.builtin_scene("cornell_box"), diffuse=True)
     camera = PLACES["cornell_box"].camera().at_resolution(24, 16)
     try:
         renderers = [mitsuba_peer.renderer(scene, camera, path._path(3), 64, variant) for variant in path.VARIANTS]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 
 import numpy as np
@@ -11,16 +12,16 @@ from PIL import Image
 import warp_gi as gi
 from warp_gi.bench import mitsuba_reference, previews
 from warp_gi.bench.compare import reference as compare_reference
-from warp_gi.bench.harness import places, presets
+from warp_gi.bench.harness import catalogue, places, scenes
 from warp_gi.bench.harness.places import PLACES, Place
 from warp_gi.bench.harness.stages import Case
 from warp_gi.bench.peers import blender_peer
-from warp_gi.bench.suites import path, rays
-from warp_gi.bench.suites.dvf import peers as dvf_peers
 from warp_gi.bench.suites.dvf import views as dvf_views
+from warp_gi.bench.suites.path import suite as path
 from warp_gi.bench.suites.probes import defaults as probes_defaults
 from warp_gi.bench.suites.probes import denoise as probes_denoise
 from warp_gi.bench.suites.probes import views as probes_views
+from warp_gi.bench.suites.rays import suite as rays
 from warp_gi.bench.suites.reuse import quality as reuse_quality
 from warp_gi.bench.suites.reuse import views as reuse_views
 from warp_gi.sequence.exr import write_exr
@@ -31,7 +32,9 @@ BUILT = [name for name, place in PLACES.items() if not place.files]
 
 
 def cases_of(module: object) -> list[Case]:
-    return [value for value in vars(module).values() if isinstance(value, Case)]
+    """Return the cases that a module has by name, or in tuples."""
+    groups = [value if isinstance(value, tuple) else (value,) for value in vars(module).values()]
+    return [case for group in groups for case in group if isinstance(case, Case)]
 
 
 # ---- references ----
@@ -51,7 +54,7 @@ def test_references_lose_no_bounces_whatever_the_default_depth_is(monkeypatch):
     assert gi.BsdfPaths().max_depth == 8
     compared = compare_reference.computed(scene, camera, "cpu", 1, 256, centred=True)
     assert mean(compared.picture) == pytest.approx(mean(expected.numpy("beauty")), rel=0.015)
-    probes = probes_views.View(scene, camera, reference_spp=128)
+    probes = probes_views.ProbeView(scene, camera, reference_spp=128)
     assert mean(probes.reference) == pytest.approx(mean(expected.numpy("indirect")), rel=0.03)
     reuse = reuse_views.Truth(scene, camera, spp=128)
     assert mean(reuse.mean("indirect")) == pytest.approx(mean(expected.numpy("indirect")), rel=0.03)
@@ -101,7 +104,7 @@ def test_what_lights_a_place_is_its_own_or_the_tables():
 
 
 def test_files_are_read_and_what_is_missing_is_said(monkeypatch, tmp_path):
-    monkeypatch.setattr(presets, "SCENES", tmp_path)
+    monkeypatch.setattr(scenes, "SCENES", tmp_path)
     for name, place in PLACES.items():
         assert bool(place.missing) == (name not in BUILT)
         assert not place.missing or "WARP_GI_SCENES" in place.missing
@@ -114,38 +117,21 @@ def test_files_are_read_and_what_is_missing_is_said(monkeypatch, tmp_path):
     write_exr(tmp_path / "sky.exr", {"beauty": np.full((4, 8, 3), 2.0)}, {})
     assert place.missing == "" and place.scene().triangle_count == 1
     np.testing.assert_allclose(place.scene().environment.mean_radiance, 2.0, rtol=1e-3)
-    assert PLACES["dragon"].files == (presets.DRAGON,) and "environments" in PLACES["sponza_courtyard"].missing
+    assert PLACES["dragon"].files == (scenes.DRAGON,) and "environments" in PLACES["sponza_courtyard"].missing
 
 
 # ---- suites ----
 
 
 def test_suites_take_places_of_the_table():
-    cases = [*dvf_views.CASES, *reuse_quality.CASES, *probes_denoise.CASES, *mitsuba_reference.PICTURES.values()]
-    cases += probes_defaults.CASES
-    cases += [case for module in (probes_views, reuse_views, dvf_peers) for case in cases_of(module)]
-    taken = {case.place for case in [*cases, *path.CASES]} | {*rays.CASES.values(), *path.FIRST_FRAMES.values()}
-    taken |= {blender_peer.FULL.scene, blender_peer.QUICK.scene}
-    assert taken <= set(PLACES) and len(taken) > 15
+    files = [path for path in sorted(catalogue.FOLDER.glob("*/*.py")) if path.stem != "__init__"]
+    modules = [importlib.import_module(f"warp_gi.bench.suites.{path.parent.name}.{path.stem}") for path in files]
+    taken = {case.place for module in modules for case in cases_of(module)}
+    taken |= {case.place for case in mitsuba_reference.PICTURES.values()}
+    taken |= {*rays.CASES.values(), *path.FIRST_FRAMES.values(), blender_peer.FULL.scene, blender_peer.QUICK.scene}
+    assert taken <= set(PLACES) and len(taken) > 20
     for picture in previews.README_PICTURES.values():
         assert set(picture.places) <= set(BUILT)  # pictures of others' scenes are not ours to give away
-
-
-def test_rows_are_named_as_in_results_before():
-    assert [case.name for case in dvf_views.CASES] == ["Sponza", "atrium", "Bistro", "street"]
-    assert [case.name for case in reuse_quality.CASES] == [
-        "warehouse",
-        "mine, spot",
-        "mine, spot, one bounce",
-        "dragon",
-        "Bistro",
-        "modern hall",
-        "cornell_box",
-        "sphere_row",
-    ]
-    names = {case.name for case in cases_of(probes_views)}
-    assert names == {"Cornell box", "living room", "living room, all", "living room, its materials", "Sponza"}
-    assert [case.name for case in probes_denoise.CASES] == ["cornell_box", "atrium"]
 
 
 def test_a_case_changes_materials_and_nothing_else():
@@ -159,7 +145,7 @@ def test_a_case_changes_materials_and_nothing_else():
 
 
 def test_suites_have_something_to_do_without_files(monkeypatch, tmp_path):
-    monkeypatch.setattr(presets, "SCENES", tmp_path)
+    monkeypatch.setattr(scenes, "SCENES", tmp_path)
     lists = [dvf_views.CASES, reuse_quality.QUICK_CASES, probes_denoise.CASES, probes_defaults.QUICK_CASES, path.CASES]
     for cases in (*lists, [PLACES[rays.CASES[name]] for name in rays.QUICK_SCENES]):
         assert any(not case.missing for case in cases)
@@ -169,7 +155,7 @@ def test_suites_have_something_to_do_without_files(monkeypatch, tmp_path):
 
 
 def test_previews_are_pngs_and_missing_places_are_passed_over(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(presets, "SCENES", tmp_path)
+    monkeypatch.setattr(scenes, "SCENES", tmp_path)
     monkeypatch.setattr(previews, "WIDTH", 24)
     folder = tmp_path / "seen"
     assert previews.main(["cornell_box", "sponza", "strobe", "-o", str(folder), "--spp", "4"]) == 0

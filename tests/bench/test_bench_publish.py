@@ -8,11 +8,12 @@ import re
 import pytest
 
 import warp_gi as gi
-from warp_gi.bench.harness import markdown, runner
+from warp_gi.bench.harness import catalogue, columns, markdown
 from warp_gi.bench.publish import command as publish
-from warp_gi.bench.publish.figures import Column, Figure, Grid, Region, Text, region_text
+from warp_gi.bench.publish.figures import Figure, Grid, GridColumn, Headline, Region, Text, headlines_text, region_text
 from warp_gi.bench.publish.page import MOST_COLUMNS, page
-from warp_gi.bench.suites import compile, sequence
+from warp_gi.bench.suites.compile import suite as compile
+from warp_gi.bench.suites.sequence import suite as sequence
 
 MARKED = "before\n<!-- results: path -->\nold\n<!-- end -->\nafter\n"
 CASE = {"suite": "path", "commit": "0123abc", "cpu": "Some CPU", "case": "room | lamp"}
@@ -22,33 +23,42 @@ ROWS = [
     CASE | {"case": "first frame", "wall s": 2.0, "pixels": "8x8"},
     {"suite": "other", "table": "times: paper, RTX", "case": "theirs", "ms": 3.0},
 ]
-SMALL = Region(
+COLUMNS = columns.columns(
     "path",
+    columns.keys("case", "pixels"),
+    columns.measured(columns.TIME, "s", "lower", "ours wall s"),
+    columns.measured(columns.RATIO, "times", "higher", "faster, wall", "faster at equal error, cpu"),
+)
+SMALL = Region(
+    COLUMNS,
+    "**Small**:",
     (
         Grid(
             "picture",
             {"room | lamp": {"case": "room | lamp"}},
             (
-                Column("ours, s", Figure("ours wall s")),
-                Column("faster", Figure("faster, wall", digits=3, at_least=1.0)),
-                Column("equal error", Figure("faster at equal error, cpu", digits=3, at_least=1.0)),
+                GridColumn("ours, s", Figure("ours wall s")),
+                GridColumn("faster", Figure("faster, wall", digits=3, at_least=1.0)),
+                GridColumn("equal error", Figure("faster at equal error, cpu", digits=3, at_least=1.0)),
             ),
         ),
         Text("The first of {pixels} takes {s} s.", {"pixels": Figure("pixels"), "s": Figure("wall s")}),
     ),
 )
-"""Stands for the README's own region "path"."""
-SUITES = runner.suites()
+"""Stands for the region "path"."""
+FIRST = Headline(COLUMNS, "Paths", "traces", Text("first in {s} s", {"s": Figure("wall s")}), "paths", "paths")
+SUITES = catalogue.suites()
 
 
 @pytest.fixture(autouse=True)
 def suites_found_once(monkeypatch):
-    monkeypatch.setattr(runner, "suites", lambda: SUITES)
+    monkeypatch.setattr(catalogue, "suites", lambda: SUITES)
 
 
 @pytest.fixture
 def root(tmp_path, monkeypatch):
-    monkeypatch.setitem(publish.REGIONS, "path", SMALL)
+    monkeypatch.setattr(publish, "regions", lambda: {"path": SMALL})
+    monkeypatch.setattr(publish, "headlines", lambda: (FIRST,))
     (tmp_path / "bench/results").mkdir(parents=True)
     lines = "".join(json.dumps(row) + "\n" for row in ROWS)
     (tmp_path / "bench/results/path.jsonl").write_text(lines, encoding="utf-8")
@@ -116,7 +126,7 @@ def test_marks_that_cannot_be_filled(root, text, words):
 
 def test_results_that_are_missing(root):
     with pytest.raises(gi.OptionError, match=r"'path' have no value of 'faster at equal error, cpu' for case 'room"):
-        publish.readme(MARKED, ROWS[:1])
+        publish.texts_of(ROWS[:1])
     (root / "bench/results/path.jsonl").unlink()
     with pytest.raises(gi.OptionError, match=r"no \*.jsonl there"):
         publish.publish(root)
@@ -129,7 +139,7 @@ def test_the_readme_has_the_processor_s_figures_and_the_page_both(root):
     path.write_text("".join(json.dumps(row | {"device": "cpu"}) + "\n" for row in ROWS), encoding="utf-8")
     text = publish.pages(root)
     assert "77" not in text[publish.README] and "| 10 |" in text[publish.README]
-    parts = text[publish.PAGE].split("\n## ")
+    parts = text[publish.PAGE].partition("\n## All results")[2].split("\n## ")
     assert [part.partition("\n")[0] for part in parts[1:]] == ["other", "path, machine 1", "path, machine 2"]
     assert (
         ["77" in part for part in parts[2:]] == [False, True]
@@ -146,7 +156,7 @@ def test_results_without_a_region_s_column_end_in_one_line(root, monkeypatch, ca
     (root / "bench/results/path.jsonl").write_text(json.dumps(ROWS[0]) + "\n", encoding="utf-8")
     assert publish.main([]) == 2
     error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "README, region 'path'" in error
+    assert error.count("\n") == 1 and "region 'path'" in error
     assert (root / "README.md").read_text(encoding="utf-8") == MARKED and not (root / "docs").exists()
 
 
@@ -192,15 +202,19 @@ def test_a_figure_typed_by_hand_is_found(figure):
 
 # ---- regions ----
 
+OF_S = columns.columns(
+    "s", columns.keys("case", "mode", "spp"), columns.notes("aim"), [columns.Column("x", "", None, columns.COUNT)]
+)
+
 
 def text_of(part, rows):
     """Return a region of one part without its last line, on how it was measured."""
-    return region_text("r", Region("s", (part,)), [{"suite": "s"} | row for row in rows]).rpartition("\n\n")[0]
+    return region_text("r", Region(OF_S, "", (part,)), [{"suite": "s"} | row for row in rows]).rpartition("\n\n")[0]
 
 
 def cells_of(figure, rows, unless=None):
     """Return the cells of a table of one column, a line for "a" and one for "b"."""
-    grid = Grid("case", {case: {"case": case} for case in "ab"}, (Column("x", figure, unless or {}),), "t")
+    grid = Grid("case", {case: {"case": case} for case in "ab"}, (GridColumn("x", figure, unless or {}),), "t")
     return [line.split(" | ")[1].removesuffix(" |") for line in text_of(grid, rows).splitlines()[2:]]
 
 
@@ -224,6 +238,21 @@ def test_values_short_of_their_aim_are_bold():
     assert cells_of(Figure("x", at_least=0.1234, at_most=2.0), AB) == ["0.12", "2.0"]
 
 
+def test_a_figure_may_be_a_ratio_of_columns_and_a_table_have_a_line_for_each_value():
+    assert cells_of(Figure("x", over="aim"), [row | {"aim": 0.1} for row in AB]) == ["1.2", "20"]
+    grid = Grid("case", "case", (GridColumn("x", Figure("x")),), "t")
+    lines = text_of(grid, [*AB[::-1], {"table": "u", "case": "c", "x": 1.0}]).splitlines()
+    assert lines[2:] == ["| b | 2.0 |", "| a | 0.12 |"]
+
+
+def test_headlines_are_lines_of_a_table_and_those_of_the_base_come_last():
+    words = Text("{x} of {case}", {"x": Figure("x"), "case": Figure("case")}, "t")
+    lines = [Headline(OF_S, name, "does", words, "Page", "page", "A 2020", name == "base") for name in ("base", "top")]
+    table = headlines_text(lines, [{"suite": "s"} | row for row in AB[:1]]).splitlines()
+    link = "[Page](docs/techniques/page.md), after A 2020"
+    assert table[2:] == [f"| `{name}` | does | 0.12 of a | {link} |" for name in ("top", "base")]
+
+
 def test_a_column_can_have_nothing_to_show():
     assert cells_of(Figure("x"), AB, {"aim": 0.2}) == ["none", "2.0"]
 
@@ -245,7 +274,7 @@ def test_a_value_that_the_results_lack_is_named(row):
 def test_a_region_names_each_machine_and_commit_once_and_a_quick_run():
     common = {"suite": "s", "x": 1.0, "cpu": "C", "python": "3", "mitsuba": "3.9"}
     rows = [common | {"commit": c, "quick": q} for c, q in (("k", False), ("l", True), ("k", False))]
-    text = region_text("r", Region("s", (Text("{x}", {"x": Figure("x")}),)), [*rows, {"suite": "o", "x": 2.0}])
+    text = region_text("r", Region(OF_S, "", (Text("{x}", {"x": Figure("x")}),)), [*rows, {"suite": "o", "x": 2.0}])
     assert text.startswith("1.0\n")
     assert text.endswith("<sub>Measured at commit k, l, C, quick run, not for quoting, mitsuba 3.9.</sub>")
 
@@ -254,7 +283,7 @@ def test_the_suites_compile_and_sequence_have_what_their_regions_show():
     frame = {"cold s": 3.0, "warm s": 0.25}
     module = {"module": "m", "first frame needs it": True, "cold s": 2.0, "warm s": 0.5, "object kB": 10.0}
     rows = [{"suite": "compile", "table": compile.FRAME} | compile.frame_row([module], frame)]
-    text = " ".join(region_text("compile", publish.REGIONS["compile"], rows).split())
+    text = " ".join(region_text("compile", publish.regions()["compile"], rows).split())
     assert "needs 1 kernel modules, 10 kB" in text and "3.0 s to compile and load, 0.25 s from" in text
     found = {
         "wall s": 100.0,
@@ -270,8 +299,8 @@ def test_the_suites_compile_and_sequence_have_what_their_regions_show():
     blender = {"table": "Blender", "scene": "atrium", "pixels": "8x8", "spp": 16, "frames": 48, "blender": "5.0"}
     blender |= {"ours frames a minute": 30.0, "blender frames a minute": 60.0, "faster": 0.5, "means differ": -0.001}
     rows = [{"suite": "sequence"} | row for row in [*rows, blender]]
-    text = " ".join(region_text("sequence", publish.REGIONS["sequence"], rows).split())
-    assert "| path, denoised | 300 | 3.0 | 0.10 | 1.0 | 2.0 |" in text
+    text = " ".join(region_text("sequence", publish.regions()["sequence"], rows).split())
+    assert all(f"| {name} | 300 | 3.0 | 0.10 | 1.0 | 2.0 |" in text for name in sequence.CASES)
     assert "30 frames a minute beside its 60, **0.50** times as many; the mean is -0.10 % off" in text
 
 
@@ -280,7 +309,7 @@ def test_the_suites_compile_and_sequence_have_what_their_regions_show():
 
 def tables_of(rows):
     """Return the page's lines that are of tables, or told above one."""
-    lines = page([{"suite": "s", "table": "t"} | row for row in rows]).partition("### t")[2].splitlines()
+    lines = page([{"suite": "path", "table": "t"} | row for row in rows], {}).partition("### t")[2].splitlines()
     return [line for line in lines if line]
 
 

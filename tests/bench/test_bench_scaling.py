@@ -15,16 +15,19 @@ from warp_gi import launch
 from warp_gi.bench.harness import diff, runner
 from warp_gi.bench.report import suite_plots as report_plots
 from warp_gi.bench.report.plots import exponent
-from warp_gi.bench.suites.scaling import bakes as scaling_bakes
+from warp_gi.bench.suites.dvf import scaling as dvf_scaling
+from warp_gi.bench.suites.probes import scaling as probes_scaling
 from warp_gi.bench.suites.scaling import frames as scaling_frames
-from warp_gi.bench.suites.scaling import suite as scaling
 from warp_gi.bench.suites.scaling import triangles as scaling_triangles
+from warp_gi.bench.suites.scaling.columns import COLUMNS
 from warp_gi.bench.suites.scaling.fits import Growth, words
 from warp_gi.bench.suites.scaling.mesh import CROWD_VIEW, HALL, LAMP_AREA, SIDE, crowd, lamp_hall
 from warp_gi.color import LUMINANCE
 
 
 def table(rows: list[dict], name: str) -> list[dict]:
+    """Return the rows of a table; all of ``rows`` have columns that the suite declares."""
+    assert COLUMNS.undeclared(rows) == []
     return [row for row in rows if row["table"] == name]
 
 
@@ -97,7 +100,7 @@ def test_lamps_share_their_light():
         assert np.allclose(high - low, HALL, atol=0.01)  # the lamps are within
     assert powers[2] == pytest.approx(np.pi * LAMP_AREA * 15.0 * LUMINANCE.sum(), rel=1e-3)
     assert powers[1] == pytest.approx(powers[2], rel=1e-3) and powers[0] == pytest.approx(powers[2], rel=0.3)
-    row = scaling_frames.EMITTERS["LightHierarchy"]
+    row = scaling_frames.BASELINES["LightHierarchy"]
     picture = next(
         iter(gi.render(lamp_hall(10), scaling_frames.HALL_VIEW.at_resolution(16, 9), gi.Pipeline(emitters=row)))
     )
@@ -186,12 +189,12 @@ def test_lights_have_a_row_for_each_estimator():
     rows = scaling_frames.light_rows_of((10, 200), (24, 16), 2, "cpu")
     lights, growth = table(rows, "lights"), table(rows, "lights: growth")
     assert len(lights) == 6
-    both = [(name, what) for name in scaling_frames.EMITTERS for what in ("frame cost s", "lights MB")]
+    both = [(name, what) for name in scaling_frames.emitters() for what in ("frame cost s", "lights MB")]
     assert [(row["estimator"], row["what"]) for row in growth] == both
     for row in lights:
         assert row["frame cpu s"] >= 0 and row["start s"] >= 0 and row["relative error"] > 0 and row["scene s"] > 0
     sizes = {(row["estimator"], row["lights"]): row["lights MB"] for row in lights}
-    for name in scaling_frames.EMITTERS:
+    for name in scaling_frames.emitters():
         assert sizes[name, 200] > sizes[name, 10]
     assert sizes["VisibilityLightCache", 200] > sizes["LightHierarchy", 200] > sizes["PowerLights", 200]
 
@@ -226,7 +229,7 @@ def test_pixels_are_rendered_in_processes_of_their_own(monkeypatch):
             super().__init__(workers)
 
     monkeypatch.setattr(scaling_frames, "ProcessPoolExecutor", Here)
-    monkeypatch.setattr(scaling_frames, "PRESETS", ("path",))
+    monkeypatch.setattr(scaling_frames, "presets", lambda: ["path"])
     monkeypatch.setattr(scaling_frames, "SCENE", "cornell_box")
     rows = scaling_frames.pixel_rows_of((0.0005, 0.02), "cpu")
     assert begun == [(1, "spawn")] * 2
@@ -247,8 +250,8 @@ def test_bakes_of_more_samples_err_less(monkeypatch):
     box = gi.builtin_scene("sphere_row")
     box.environment = (1.0, 1.0, 1.0)
     view = gi.builtin_camera_path("sphere_row").camera(0)
-    monkeypatch.setattr(scaling_bakes, "ATRIUM", SimpleNamespace(scene=lambda: box, camera=lambda: view))
-    rows = scaling_bakes.sample_rows_of((300, 30_000), (24, 16), 1, "cpu")
+    monkeypatch.setattr(dvf_scaling, "ATRIUM", SimpleNamespace(scene=lambda: box, camera=lambda: view))
+    rows = dvf_scaling.sample_rows_of((300, 30_000), (24, 16), 1, "cpu")
     few, many = table(rows, "bake samples")
     assert many["RMSE"] < few["RMSE"] and few["bake cpu s"] > 0 and few["cells"] == many["cells"] > 0
     cost, error = table(rows, "bake samples: growth")
@@ -256,7 +259,7 @@ def test_bakes_of_more_samples_err_less(monkeypatch):
 
 
 def test_probes_grow_with_their_texels():
-    rows = scaling_bakes.probe_rows_of((16, 48), (2, 1, 1), 1, "cpu")
+    rows = probes_scaling.probe_rows_of((16, 48), (2, 1, 1), 1, "cpu")
     small, large = table(rows, "probes")
     assert large["MB"] > small["MB"] > 0 and small["bake cpu s"] > 0
     assert [row["what"] for row in table(rows, "probes: growth")] == ["bake cost s", "MB"]
@@ -278,17 +281,7 @@ def test_speed_up_is_of_wall_seconds(monkeypatch):
 # ---- the suite ----
 
 
-def test_the_suite_is_found_and_has_its_parts():
-    assert runner.suites()["scaling"].startswith("Scaling: how time and memory grow")
-    assert list(scaling.PARTS) == ["triangles", "lights", "pixels", "samples", "probes", "threads"]
-
-
-def test_columns_say_what_is_better(triangles):
-    columns = {column for row in triangles for column in row}
-    for column in ("exponent", "growth for ten times", "build cpu s", "ours ns a ray", "bytes a triangle"):
-        assert column in columns and not diff.measure_of(column).higher_is_better
-    assert diff.measure_of("ours / embree").higher_is_better and diff.measure_of("efficiency").higher_is_better
-    assert diff.measure_of("embree ns a ray") is None
+def test_rows_are_told_apart(triangles):
     again = [{**row, "suite": "scaling"} for row in triangles]
     assert diff.compare(again, again).matched == len({diff.identity_of(row) for row in again if "skipped" not in row})
     assert len({diff.identity_of(row) for row in again}) == len(again)

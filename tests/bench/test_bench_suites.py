@@ -9,14 +9,16 @@ import pytest
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.bench.harness import diff, measure, presets, records, runner
+from warp_gi.bench.harness import catalogue, columns, measure, records, runner, scenes
 from warp_gi.bench.harness import gallery as galleries
 from warp_gi.bench.harness.gallery import CLOSED, Gallery, PictureSet
 from warp_gi.bench.peers import blender_peer
 from warp_gi.bench.report import suite_plots as report_plots
-from warp_gi.bench.suites import compile, rays, sequence
+from warp_gi.bench.suites.compile import suite as compile
 from warp_gi.bench.suites.probes import suite as probes
+from warp_gi.bench.suites.rays import suite as rays
 from warp_gi.bench.suites.reuse import suite as reuse
+from warp_gi.bench.suites.sequence import suite as sequence
 from warp_gi.cli import main as cli
 
 # ---- compile ----
@@ -40,6 +42,7 @@ def test_the_suite_counts_what_the_first_frame_needs(monkeypatch):
     quick, full = compile.run(quick=True), compile.run(quick=False)
     assert [row.get("module") for row in quick] == ["compose", "gbuffer", None]
     assert len(full) > 20 and [row["module"] for row in full if "failed" in row] == ["bvh_build"]
+    assert catalogue.columns_of("compile").undeclared(full) == []
     for rows in (quick, full):
         last = rows[-1]
         assert last["table"] == "first frame" and last["modules"] == last["measured"] == 2
@@ -57,6 +60,7 @@ SMALL = sequence.Size(6, "24x16", 2)
 def test_a_sequence_is_rendered_and_measured():
     found = sequence.measure("cornell_box", ("--denoise", "spatiotemporal"), SMALL, "cpu")
     rows = sequence.rows_of("path", found, SMALL)
+    assert catalogue.columns_of("sequence").undeclared(rows) == []
     speed, stages, memory, *series = rows
     assert (
         speed["frames a minute"] == pytest.approx(360 / (speed["wall s"] - stages["compile s"]))
@@ -127,7 +131,7 @@ def test_blender_is_a_row_where_it_is_missing(monkeypatch):
 
 
 def test_the_exported_file_holds_the_scene(tmp_path):
-    scene = presets.peer_scene(gi.builtin_scene("cornell_box"), diffuse=True)
+    scene = scenes.peer_scene(gi.builtin_scene("cornell_box"), diffuse=True)
     blender_peer.write_glb(scene, tmp_path / "s.glb")
     loaded = gi.load_scene(tmp_path / "s.glb")
     assert (loaded.triangle_count, loaded.emitter_count) == (scene.triangle_count, scene.emitter_count)
@@ -197,7 +201,7 @@ def test_parts_of_suites_get_the_gallery_if_they_take_it(monkeypatch):
 def test_pictures_are_kept_for_a_report_alone(arguments, is_open, tmp_path, monkeypatch, capsys):
     seen = []
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(rays, "run", lambda quick, device, gallery: seen.append(gallery) or [{"case": "one"}])
+    monkeypatch.setattr(rays, "run", lambda quick, device, gallery: seen.append(gallery) or [{"scene": "one"}])
     assert cli.main(["bench", "rays", *arguments]) == 0
     assert [(gallery.suite, gallery.is_open) for gallery in seen] == [("rays", is_open)]
 
@@ -209,18 +213,18 @@ def test_the_last_row_is_of_the_whole_suite(monkeypatch):
     def run(quick: bool, device: str) -> list[dict]:
         np.ones(40_000_000)  # 320 MB, for a moment
         launch.compile_seconds += 2.0
-        return [{"case": "one"}]
+        return [{"scene": "one"}]
 
     monkeypatch.setattr(launch, "compile_seconds", 7.0)
     monkeypatch.setattr(rays, "run", run)
     first, whole = runner.run_suite("rays", True, "cpu")
-    assert first == {"case": "one"} and whole["table"] == "run" and whole["compile s"] == pytest.approx(2.0)
+    assert first == {"scene": "one"} and whole["table"] == "run" and whole["compile s"] == pytest.approx(2.0)
     assert 0 < whole["cpu s"] and 0 < whole["wall s"] < 60
     assert whole["peak GB"] > 0.32
     monkeypatch.setattr(rays, "run", lambda quick, device: [])
     if measure._forget_peak():  # where the system can: of this run, not of before
         assert runner.run_suite("rays", True, "cpu")[-1]["peak GB"] < whole["peak GB"] - 0.2
-    assert all(diff.measure_of(column) in (diff.TIME, diff.MEMORY) for column in whole if column != "table")
+    assert all(columns.Columns("any")[name].better == "lower" for name in whole if name != "table")
 
 
 def test_versions_of_peers_are_told(monkeypatch):
@@ -253,7 +257,7 @@ def test_all_goes_on_after_a_suite_that_fails(tmp_path, monkeypatch, capsys):
             raise RuntimeError("out of\nluck")
         return [{"case": name, "wall s": 1.5}]
 
-    monkeypatch.setattr(runner, "suites", lambda: dict.fromkeys(("bad", "first", "last"), "Measures."))
+    monkeypatch.setattr(catalogue, "suites", lambda: dict.fromkeys(("bad", "first", "last"), "Measures."))
     monkeypatch.setattr(runner, "run_suite", run_suite)
     page, lines = tmp_path / "r.html", tmp_path / "r.jsonl"
     arguments = ["bench", "all", "--quick", "--html", str(page), "--json", str(lines)]
@@ -270,14 +274,14 @@ def test_all_goes_on_after_a_suite_that_fails(tmp_path, monkeypatch, capsys):
         assert f"<h2>{suite}</h2>" in section and f"case of {suite}" in section  # also what was drawn before it failed
     said = capsys.readouterr()
     assert said.err == "failed: bad\n" and str(lines) in said.out
-    monkeypatch.setattr(runner, "suites", lambda: {"first": "Measures."})
+    monkeypatch.setattr(catalogue, "suites", lambda: {"first": "Measures."})
     assert cli.main(arguments) == 0
     assert [row["suite"] for row in records.read([lines])] == ["first"]
 
 
 def test_a_part_that_failed_is_exit_code_1(monkeypatch, capsys):
     rows = [{"case": "a", "wall s": 1.0}, {"case": "b", "failed": "no luck"}]
-    monkeypatch.setattr(runner, "suites", lambda: {"one": "Measures."})
+    monkeypatch.setattr(catalogue, "suites", lambda: {"one": "Measures."})
     monkeypatch.setattr(runner, "run_suite", lambda *given: rows)
     assert [cli.main(["bench", name]) for name in ("one", "all")] == [1, 1]
     assert capsys.readouterr().err == "failed: one\n" * 2
@@ -286,7 +290,7 @@ def test_a_part_that_failed_is_exit_code_1(monkeypatch, capsys):
 
 
 def test_parts_of_a_suite_are_chosen_by_name(monkeypatch, capsys):
-    monkeypatch.setitem(reuse.PARTS, "cost", lambda quick, device: [{"case": "a", "quick": quick}])
+    monkeypatch.setitem(reuse.PARTS, "cost", lambda quick, device: [{"case": "a", "bits": 1 + quick}])
     assert cli.main(["bench", "reuse", "--parts", "cost", "--quick", "--json", "-"]) == 0
     rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]  # lines alone
     assert [row.get("case") for row in rows] == ["a", None] and rows[1]["table"] == "run"
@@ -315,7 +319,7 @@ def test_all_keeps_what_was_measured_before_an_interrupt(tmp_path, monkeypatch, 
             raise KeyboardInterrupt
         return [{"case": name}]
 
-    monkeypatch.setattr(runner, "suites", lambda: dict.fromkeys(("first", "second"), ""))
+    monkeypatch.setattr(catalogue, "suites", lambda: dict.fromkeys(("first", "second"), ""))
     monkeypatch.setattr(runner, "run_suite", run_suite)
     assert cli.main(["bench", "all", "--json", str(tmp_path / "r.jsonl")]) == 130
     assert [row["suite"] for row in records.read([tmp_path / "r.jsonl"])] == ["first"]

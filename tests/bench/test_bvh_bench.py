@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import warp_gi as gi
-from warp_gi.bench.harness import presets, runner
+from warp_gi.bench.harness import runner, scenes
 from warp_gi.bench.harness.places import PLACES
-from warp_gi.bench.suites import rays
+from warp_gi.bench.suites.rays import suite as rays
+from warp_gi.bench.suites.rays.columns import COLUMNS
 
 
 def test_rows_hold_every_contender_and_all_agree():
@@ -20,6 +21,7 @@ def test_rows_hold_every_contender_and_all_agree():
         "primary": rays.primary_rays(gi.CameraKey(0.0, (0.5, 0.5, 3.0), (0.5, 0.5, 0.5), hfov=40.0), 6000),
     }
     build, *races = rays.compare("soup", points, indices, batches, repetitions=1)
+    assert COLUMNS.undeclared([build, *races]) == []
     has_peer = "skipped" not in races[0]
     races = races if has_peer else races[1:]
     assert build["triangles"] == 300 and build["ours build s"] > 0.0 and build["bytes a triangle"] > 0.0
@@ -51,7 +53,7 @@ def test_rays_start_on_the_surface_and_are_unit():
 
 
 def test_missing_scenes_give_a_row_and_unknown_ones_an_error(monkeypatch, tmp_path):
-    monkeypatch.setattr(presets, "SCENES", tmp_path)
+    monkeypatch.setattr(scenes, "SCENES", tmp_path)
     monkeypatch.setattr(rays, "QUICK_RAYS", 1000)
     monkeypatch.setitem(rays.CASES, "box", "cornell_box")
     monkeypatch.setattr(rays, "QUICK_SCENES", ("living room", "sponza", "box"))

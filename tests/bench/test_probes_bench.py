@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 import warp_gi as gi
-from warp_gi.bench.harness import presets, stages
+from warp_gi.bench.harness import scenes, stages
 from warp_gi.bench.harness.gallery import Gallery
 from warp_gi.bench.harness.places import PLACES
 from warp_gi.bench.publish.figures import Grid
-from warp_gi.bench.publish.techniques import DENOISERS, PROBES
 from warp_gi.bench.suites.probes import defaults as probes_defaults
 from warp_gi.bench.suites.probes import denoise as probes_denoise
 from warp_gi.bench.suites.probes import irradiance as probes_irradiance
 from warp_gi.bench.suites.probes import light as probes_light
 from warp_gi.bench.suites.probes import rays as probes_rays
-from warp_gi.bench.suites.probes import suite as probes
 from warp_gi.bench.suites.probes import views as probes_views
+from warp_gi.bench.suites.probes.columns import COLUMNS
+from warp_gi.bench.suites.probes.regions import REGIONS
 from warp_gi.techniques.light_field.places import camera_rows
 
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # of bakes for another camera, or for none
@@ -28,12 +28,13 @@ SMALL = {"resolution": 32, "rays": 1}
 def assert_published(table, rows):
     """Assert that the rows have every column of their table that the README shows, and by which it finds them."""
     figures = []
-    for part in (*PROBES.parts, *DENOISERS.parts):
+    for part in (part for region in REGIONS.values() for part in region.parts):
         of_part = [column.figure for column in part.columns] if isinstance(part, Grid) else part.figures.values()
         figures += [figure for figure in of_part if (figure.table or part.table) == table]
         if isinstance(part, Grid) and part.table == table:
             assert all(set(only) <= set(row) for only in part.lines.values() for row in rows)
     assert figures and {row["table"] for row in rows} == {table}
+    assert COLUMNS.undeclared(rows) == []
     for figure in figures:
         limits = {limit for limit in (figure.at_least, figure.at_most) if isinstance(limit, str)}
         assert all({figure.key, *figure.only, *limits} <= set(row) for row in rows), figure
@@ -42,7 +43,7 @@ def assert_published(table, rows):
 
 
 @pytest.fixture(scope="module")
-def view() -> probes_views.View:
+def view() -> probes_views.ProbeView:
     return probes_views.view_of(probes_views.CORNELL, (24, 16), "cpu", 64)
 
 
@@ -134,13 +135,13 @@ def furnace():
         ((-1, -1, 1), (0, 0, -2), (0, 2, 0)),
         ((1, -1, -1), (0, 0, 2), (0, 2, 0)),
     )
-    return gi.Scene([gi.Node("cube", [presets.quad(*corner, wall, f"wall {i}") for i, corner in enumerate(corners)])])
+    return gi.Scene([gi.Node("cube", [scenes.quad(*corner, wall, f"wall {i}") for i, corner in enumerate(corners)])])
 
 
 def test_irradiance_is_that_of_a_furnace():
     """Reflected radiance 1 from everywhere is pi W/m^2, whatever the surface itself reflects; direct light is none."""
     camera = gi.Camera.look_at((0.1, 0.1, 0.7), (0, -0.1, -1), hfov=70, resolution=(12, 8))
-    stage = probes_views.View(furnace(), camera).stage(1, mode="irradiance", counts=(2, 2, 2), **SMALL)
+    stage = probes_views.ProbeView(furnace(), camera).stage(1, mode="irradiance", counts=(2, 2, 2), **SMALL)
     paths = probes_irradiance.path_traced(stage, 256, 3)
     assert paths.shape == (8, 12, 3) and paths.mean() == pytest.approx(np.pi, rel=0.01)
     np.testing.assert_allclose(paths, np.pi, rtol=0.25)
@@ -200,9 +201,9 @@ def test_default_settings_are_those_of_the_class(view, monkeypatch):
 
 
 def test_the_readme_shows_every_place_of_default_settings():
-    (grid,) = [part for part in PROBES.parts if part.table == probes_defaults.TERM_TABLE]
+    (grid,) = [part for part in REGIONS["probes"].parts if part.table == probes_defaults.TERM_TABLE]
     assert [only["case"] for only in grid.lines.values()] == [case.name for case in probes_defaults.CASES]
-    assert len(PROBES.parts) == 6 and probes_defaults.MOST_BAKE == 40
+    assert probes_defaults.MOST_BAKE == 40
     assert {case.within for case in probes_defaults.CASES if "sponza" in case.place} == {0.12}
 
 
@@ -247,7 +248,7 @@ def test_bakes_tell_time_memory_and_passes(view):
 def test_denoisers_are_compared_with_their_own_pipeline(monkeypatch):
     monkeypatch.setattr(probes_denoise, "FRAME", 2)
     monkeypatch.setattr(probes_denoise, "RAYS", (1,))
-    scene = presets.peer_scene(gi.builtin_scene("cornell_box"), diffuse=True)
+    scene = scenes.peer_scene(gi.builtin_scene("cornell_box"), diffuse=True)
     path = gi.builtin_camera_path("cornell_box").at_resolution(32, 24)
     gallery = Gallery()
     *skipped, row = probes_denoise.pipeline_rows("box", scene, path, "paths", {}, 32, "cpu", gallery)
@@ -261,10 +262,9 @@ def test_denoisers_are_compared_with_their_own_pipeline(monkeypatch):
 
 
 def test_missing_scenes_give_rows_that_say_so(monkeypatch, tmp_path):
-    monkeypatch.setattr(presets, "SCENES", tmp_path)
+    monkeypatch.setattr(scenes, "SCENES", tmp_path)
     for place in (probes_views.LIVING_ROOM, probes_views.SPONZA):
         assert "WARP_GI_SCENES" in place.missing
     monkeypatch.setattr(probes_defaults, "QUICK_CASES", (probes_defaults.CASES[0],))
     (row,) = probes_defaults.default_rows(True, "cpu")
     assert row["case"] == "living room, white sky" and "WARP_GI_SCENES" in row["skipped"]
-    assert set(probes.PARTS) == {"defaults", "rays", "leaks", "light", "bakes", "denoise"}

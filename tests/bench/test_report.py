@@ -307,13 +307,13 @@ def test_what_two_machines_measured_stands_apart(tmp_path):
 def test_a_suite_writes_its_report(tmp_path, monkeypatch, capsys):
     def run(quick, device, gallery):
         gallery.add(report.PictureSet("a room", np.ones((4, 5, 3))))
-        return [{"case": "one", "wall s": 2.0}]
+        return [{"scene": "one", "wall s": 2.0}]
 
-    monkeypatch.setattr("warp_gi.bench.suites.rays.run", run)
+    monkeypatch.setattr("warp_gi.bench.suites.rays.suite.run", run)
     page, lines = tmp_path / "new" / "r.html", tmp_path / "r.jsonl"
     assert cli.main(["bench", "rays", "--quick", "--html", str(page), "--json", str(lines)]) == 0
     text = page.read_text(encoding="utf-8")
-    assert Cells(text).tables[1] == [["case", "wall s"], ["one", "2"]] and "quick run, not for quoting" in text
+    assert Cells(text).tables[1] == [["scene", "wall s"], ["one", "2"]] and "quick run, not for quoting" in text
     assert "a room" in text.partition("<h2>rays</h2>")[2] and Cells(text).tables[2][0][:2] == ["wall s", "cpu s"]
     assert records.read([lines])[0]["wall s"] == 2.0
 

@@ -7,13 +7,13 @@ import pytest
 import warp as wp
 
 import warp_gi as gi
-from warp_gi.bench.harness import presets, runner
+from warp_gi.bench.harness import scenes
 from warp_gi.bench.harness.gallery import Gallery
 from warp_gi.bench.suites.reuse import cost as reuse_cost
 from warp_gi.bench.suites.reuse import quality as reuse_quality
-from warp_gi.bench.suites.reuse import suite as reuse
 from warp_gi.bench.suites.reuse import time as reuse_time
 from warp_gi.bench.suites.reuse import views as reuse_views
+from warp_gi.bench.suites.reuse.columns import COLUMNS
 from warp_gi.scene.animation import keyframe_matrix
 
 SIZE = (24, 16)
@@ -40,7 +40,7 @@ def test_the_truth_is_without_noise_on_average(box):
 
 
 def test_the_truth_of_a_frame_is_that_frames():
-    scene, camera = presets.guiding_ring(90.0, 5), reuse_views.RING.camera().at_resolution(*SIZE)
+    scene, camera = scenes.guiding_ring(90.0, 5), reuse_views.RING.camera().at_resolution(*SIZE)
     truths = [reuse_views.Truth(scene, camera, "cpu", 64, index) for index in (4, 5)]
     before, after = (truth.halves[0]["indirect"] for truth in truths)
     assert np.abs(before - after).mean() > 0.5 * before.mean()
@@ -87,7 +87,7 @@ def test_ratios_of_nothing_are_one():
 
 
 def test_the_ring_is_lit_by_a_spot_on_its_wall():
-    scene = presets.guiding_ring(36.0, 2)
+    scene = scenes.guiding_ring(36.0, 2)
     look = gi.Camera.look_at((0, 6, 0.01), (0, 0, 0), hfov=70.0, resolution=(64, 64))
     scheduler = gi.FrameScheduler(scene, look, pipeline(64))
     angles = []
@@ -95,10 +95,10 @@ def test_the_ring_is_lit_by_a_spot_on_its_wall():
         frame = scheduler.frame(index)
         direct, position = frame.numpy("emitters").mean(axis=-1), frame.numpy("position")
         radius = np.hypot(position[..., 0], position[..., 2])
-        on_floor = (radius < presets.RING_RADIUS) & (np.abs(position[..., 1]) < 0.01)
+        on_floor = (radius < scenes.RING_RADIUS) & (np.abs(position[..., 1]) < 0.01)
         assert direct[on_floor].max() == 0 and frame.numpy("indirect")[on_floor].mean() > 0.01
         y, x = np.nonzero(direct > 0)
-        assert (radius[y, x] > presets.RING_RADIUS).all()
+        assert (radius[y, x] > scenes.RING_RADIUS).all()
         middle = np.average(position[y, x], axis=0, weights=direct[y, x])
         assert 0.3 < middle[1] < 2.0
         angles.append(np.degrees(np.arctan2(-middle[2], middle[0])))
@@ -106,23 +106,23 @@ def test_the_ring_is_lit_by_a_spot_on_its_wall():
 
 
 def test_strobes_are_where_they_say():
-    for kind, period in presets.STROBE_PERIODS.items():
-        scene = presets.strobe(kind)
+    for kind, period in scenes.STROBE_PERIODS.items():
+        scene = scenes.strobe(kind)
         lamp = next(node for node in scene.nodes if node.name == "lamp")
         found: dict[int, set[tuple[float, ...]]] = {}
         for index in range(2 * period):
-            matrix = keyframe_matrix(lamp.keyframes, index / presets.FPS)
-            found.setdefault(presets.strobe_place(kind, index), set()).add(tuple(np.round(matrix[:3, 3], 6)))
+            matrix = keyframe_matrix(lamp.keyframes, index / scenes.FPS)
+            found.setdefault(scenes.strobe_place(kind, index), set()).add(tuple(np.round(matrix[:3, 3], 6)))
         assert all(len(places) == 1 for places in found.values())
         assert len(set.union(*found.values())) == len(found) == {"jump": 2, "slit": period // 2 + 1}[kind]
-    steps = np.diff([presets.strobe_place("slit", index) for index in range(40)])
+    steps = np.diff([scenes.strobe_place("slit", index) for index in range(40)])
     assert (np.abs(steps) == 1).all()  # never at rest
 
 
 def test_a_lamp_in_its_box_lights_nothing():
-    scene, camera = presets.strobe("jump"), reuse_views.STROBE.camera().at_resolution(*SIZE)
+    scene, camera = scenes.strobe("jump"), reuse_views.STROBE.camera().at_resolution(*SIZE)
     scheduler = gi.FrameScheduler(scene, camera, pipeline(16))
-    half = presets.STROBE_PERIODS["jump"] // 2
+    half = scenes.STROBE_PERIODS["jump"] // 2
     means = [scheduler.frame(index).numpy("beauty").mean() for index in (half - 1, half, 2 * half)]
     assert means[0] > 3 * means[1] and means[2] == pytest.approx(means[0], rel=0.3)
 
@@ -130,7 +130,7 @@ def test_a_lamp_in_its_box_lights_nothing():
 @pytest.mark.skipif(bool(reuse_views.DRAGON.missing), reason="no dragon")
 @pytest.mark.slow
 def test_the_dragon_stands_under_its_cover():
-    scene = presets.covered_dragon()
+    scene = scenes.covered_dragon()
     assert scene.emitter_count == 20
     frame = gi.FrameScheduler(scene, reuse_views.DRAGON.camera().at_resolution(64, 48), pipeline()).frame(0)
     names = [node.name for node in scene.nodes]
@@ -146,6 +146,7 @@ def test_combinations_stand_beside_the_baseline(box):
     gallery = Gallery()
     rows = reuse_quality.place_rows(place, SIZE, 32, 4, 2, "cpu", gallery)
     errors, times = rows[:6], rows[6:]
+    assert COLUMNS.undeclared(rows) == []
     assert len(times) == 6 and len({tuple(row) for row in errors}) == len({tuple(row) for row in times}) == 1
     base = errors[0]
     assert base["combination"] == reuse_quality.BASELINE
@@ -173,6 +174,7 @@ def test_targets_name_the_worst():
                 row |= {f"{term} / baseline": 1.0 + k + 0.1 * j, f"{term}, equal time": 2.0}
             rows.append(row)
     targets = reuse_quality.target_rows([*rows, {"case": "dragon", "skipped": "no file"}])
+    assert COLUMNS.undeclared(targets) == []
     assert targets[0]["target"] == 1 / 8 and targets[0]["equal samples"] == 3.0
     worst = targets[1]
     assert worst["combination"] == "worst: VisibilityLightCache + GuidedPaths" and worst["equal samples"] == 3.1
@@ -188,7 +190,7 @@ def test_paths_take_a_places_settings():
 
 def test_adaptation_starts_from_nothing():
     rows = reuse_time.place_adaptation(reuse_views.CORNELL, SIZE, 32, 1, 5, "cpu")
-    assert [row["term"] for row in rows] == ["emitters", "indirect"]
+    assert [row["term"] for row in rows] == ["emitters", "indirect"] and COLUMNS.undeclared(rows) == []
     for row in rows:
         assert len(row["MSE / settled by frame"].split()) == 6 and row["settled MSE"] > 0 and row["target"] == 8
 
@@ -196,7 +198,7 @@ def test_adaptation_starts_from_nothing():
 def test_turns_cover_bits_and_migrations():
     rows = reuse_time.turn_rows(36.0, (32, 128), (12, 12), 64, 1, (4, 6), "cpu")
     assert [(row["bits"], row["migrations"]) for row in rows] == [(32, 1), (32, 8), (128, 1), (128, 8)]
-    assert [row["target"] for row in rows] == ["", "", 20, 8]
+    assert [row["target"] for row in rows] == ["", "", 20, 8] and COLUMNS.undeclared(rows) == []
     for row in rows:
         assert len(row["MSE / settled by frame"].split()) == 6 and row["peak / settled"] >= 1
         assert row["frames until settled"] <= 6
@@ -206,6 +208,7 @@ def test_strobes_are_rows_by_what_the_lamp_does():
     base = np.ones(32)
     ours = np.where(np.arange(32) % 16 < 4, 4.0, 0.5)
     out, into = reuse_time.strobe_kind_rows("jump", "ours", {"ours": ours, "baseline": base})
+    assert COLUMNS.undeclared([out, into]) == []
     assert (out["case"], into["case"]) == ("lamp out of the box", "lamp into the box")
     for row in (out, into):
         assert row["settled MSE"] == 0.5 and row["peak / settled"] == 8 and row["frames until settled"] == 4
@@ -216,7 +219,7 @@ def test_strobes_are_rows_by_what_the_lamp_does():
 
 
 def test_strobe_series_leave_out_the_first_period(monkeypatch):
-    monkeypatch.setitem(presets.STROBE_PERIODS, "jump", 4)
+    monkeypatch.setitem(scenes.STROBE_PERIODS, "jump", 4)
     series = reuse_time.strobe_series("jump", {"paths": pipeline()}, SIZE, 64, 2, "cpu")["paths"]
     assert series.shape == (4,) and series[:2].mean() > 1.4 * series[2:].mean()
     run = reuse_views.FrameRun(None)
@@ -226,6 +229,7 @@ def test_strobe_series_leave_out_the_first_period(monkeypatch):
 
 def test_costs_list_passes_and_memory(box):
     rows = reuse_cost.place_cost(reuse_views.CORNELL, SIZE, 3, 1, "cpu")
+    assert COLUMNS.undeclared(rows) == []
     passes = {row["pass"]: row for row in rows if row["table"] == "passes"}
     assert {"learn octree", "learn emitters", "learn indirect", "preprocess emitters", "all"} <= set(passes)
     others = sum(row["ms"] for name, row in passes.items() if name != "all")
@@ -246,15 +250,10 @@ def test_bytes_are_those_of_arrays_inside_of_structs():
 
 
 def test_missing_scenes_give_rows_that_say_so(monkeypatch, tmp_path):
-    monkeypatch.setattr(presets, "SCENES", tmp_path)
+    monkeypatch.setattr(scenes, "SCENES", tmp_path)
     places = (reuse_views.DRAGON, reuse_views.BISTRO, reuse_views.HALL)
     assert all("WARP_GI_SCENES" in place.missing for place in places)
     monkeypatch.setattr(reuse_quality, "CASES", places)
     rows = reuse_quality.quality_rows(False, "cpu")
     assert [row["case"] for row in rows if "skipped" in row] == [place.name for place in places]
     assert any("paper" in row["table"] for row in rows)
-
-
-def test_the_suite_is_found_and_has_all_parts():
-    assert runner.suites()["reuse"].startswith("Sample reuse")
-    assert set(reuse.PARTS) == {"quality", "adaptation", "turning", "cost", "strobe"}

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -487,15 +486,6 @@ def test_output_that_cannot_be_encoded_is_replaced(tmp_path):
     trimesh.creation.box().export(scene)
     result = run("info", scene.name, cwd=tmp_path, env=os.environ | {"PYTHONIOENCODING": "ascii"})
     assert result.returncode == 0 and "??.ply" in result.stdout and "triangles" in result.stdout
-
-
-def test_suites_are_modules_with_run(tmp_path):
-    from warp_gi.bench.harness import runner
-
-    (tmp_path / "speed.py").write_text('"""Measures speed.\n\nMore."""\ndef run(quick, device):\n    return []\n')
-    (tmp_path / "helper.py").write_text('"""Helps."""\ndef other():\n    pass\n')
-    assert runner.suites(Path(tmp_path)) == {"speed": "Measures speed."}
-    assert "runner" not in runner.suites()
 
 
 HEAP = """

@@ -13,7 +13,7 @@ from statistics_tools import device, every_device  # noqa: F401
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.bench.harness.presets import light, quad, sphere
+from warp_gi.bench.harness.scenes import light, quad, sphere
 from warp_gi.kernels.bsdf import lambert
 from warp_gi.kernels.bvh import BvhHit
 from warp_gi.kernels.emitters import LightChoice
@@ -352,13 +352,18 @@ def test_cached_light_is_left_out_with_the_indirect_term():
 
 
 def test_a_cache_is_asked_about_a_surface_with_its_colour():
-    camera = gi.Camera.look_at((0, 0.2, 0.9), (0, 0, 0.6), hfov=120, resolution=(16, 16))
-    floor = quad((-9, 0, 9), (18, 0, 0), (0, 0, -18), gi.Material("floor", (0.5, 0.25, 1.0), specular=0.0), "floor")
-    floor.material.base_color_texture = gi.Texture("checkers", CHECKERS, srgb=False)
-    picture = cached(gi.Scene([gi.Node("floor", [floor])]), camera, 2.0, colored=1, cache_vertex=1, spp=1)["indirect"]
-    seen = picture[picture.any(axis=-1)]
-    assert seen[:, 0].max() == pytest.approx(1.0) and seen[:, 0].min() == pytest.approx(0.2)
-    np.testing.assert_allclose(seen, seen[:, :1] * [1.0, 0.5, 2.0], rtol=1e-6)
+    """Paths from a white ceiling end on a floor whose texture is a fifth everywhere."""
+    material = gi.Material("floor", (0.5, 0.25, 1.0), specular=0.0)
+    material.base_color_texture = gi.Texture("grey", np.full((4, 4, 4), 51, np.uint8), srgb=False)
+    white = gi.Material("white", (1.0, 1.0, 1.0), specular=0.0)
+    floor = quad((-9, 0, 9), (18, 0, 0), (0, 0, -18), material, "floor")
+    ceiling = quad((-9, 1, -9), (18, 0, 0), (0, 0, 18), white, "ceiling")
+    camera = gi.Camera.look_at((0, 0.5, 0), (0, 1, 0.1), up=(0, 0, 1), hfov=60, resolution=(16, 16))
+    scene = gi.Scene([gi.Node("room", [floor, ceiling])])
+    picture = cached(scene, camera, 2.0, colored=1, spp=1)["indirect"]
+    ended = picture[picture.any(axis=-1)]
+    assert len(ended) > 200
+    np.testing.assert_allclose(ended, np.tile([0.2, 0.1, 0.4], (len(ended), 1)), rtol=1e-5)
 
 
 def test_clamp_holds_for_cached_light():

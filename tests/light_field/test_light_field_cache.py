@@ -11,7 +11,7 @@ from path_tools import trace
 from statistics_tools import device, every_device  # noqa: F401
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import light, quad
+from warp_gi.bench.harness.scenes import light, quad
 from warp_gi.kernels.light_field_cache import PROBE_CACHE, VISIBILITY_EXACT, VISIBILITY_PROBES
 from warp_gi.kernels.path_samplers import ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY
 from warp_gi.kernels.path_trace import REFERENCE, path_tracer

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import warp as wp
+from scene_tools import unit
 from statistics_tools import device, every_device  # noqa: F401
 
 from warp_gi import TriangleBvh
@@ -105,10 +106,6 @@ def march(field, origins, directions, t_max=1e30, most_steps=1 << 30):
     arguments = [field, vec3s(origins), vec3s(directions), t_max, most_steps, hits]
     launch(marching.march_rays, count, arguments, device())
     return {name: getattr(hits, name).numpy() for name in ("results", "t", "probes", "texels", "counts", "stops")}
-
-
-def unit(vectors):
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def sky(origins, directions):

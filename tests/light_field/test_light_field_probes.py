@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
+from scene_tools import light, quad, sphere
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.bench.harness.presets import light, quad, sphere
 from warp_gi.kernels import denoise as denoise_kernels
 from warp_gi.kernels import light_field as field_kernels
 from warp_gi.kernels import light_field_bake as bake_kernels

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import warp_gi as gi
-from warp_gi.bench.harness import presets
+from warp_gi.bench.harness import scenes
 
-COURTYARD, WHITE = presets.SCENES / "environments" / "courtyard.exr", (1.0, 1.0, 1.0)
+COURTYARD, WHITE = scenes.SCENES / "environments" / "courtyard.exr", (1.0, 1.0, 1.0)
 NAVE, GALLERY, FLOOR = (
     gi.Camera.look_at(eye, target, hfov=65.0)
     for eye, target in (
@@ -35,10 +35,10 @@ def view_of(name: str) -> tuple[gi.Scene, gi.Camera]:
     source, sky, camera, _ = VIEWS[name]
     if camera is None:
         return gi.builtin_scene(source), gi.builtin_camera_path(source).camera(0)
-    for file in (presets.SCENES / source, sky):
+    for file in (scenes.SCENES / source, sky):
         if not isinstance(file, tuple | None) and not file.exists():
             pytest.skip(f"{file} is not there; set WARP_GI_SCENES")
-    scene = gi.load_scene(presets.SCENES / source)
+    scene = gi.load_scene(scenes.SCENES / source)
     if sky is not None:
         scene.environment = sky
     return scene, camera

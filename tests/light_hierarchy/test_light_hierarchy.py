@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import warp as wp
+from scene_tools import unit
 from scipy import stats
 from statistics_tools import chi_squared, device, every_device  # noqa: F401
 
@@ -83,10 +84,6 @@ def all_pdfs(tree, positions, normals):
     arguments = [to_device(tree, device()), count, vectors(positions), vectors(normals), pdfs]
     launch(evaluate, len(pdfs), arguments, device())
     return pdfs.numpy().reshape(-1, count).astype(np.float64)
-
-
-def unit(values):
-    return values / np.linalg.norm(values, axis=-1, keepdims=True)
 
 
 def random_points(count, random, reach=12.0):

@@ -29,11 +29,10 @@ from light_cache_tools import (
     probabilities,
     records_of,
 )
-from scene_tools import triangle
+from scene_tools import light, quad, triangle
 from statistics_tools import device, every_device  # noqa: F401
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import light, quad
 from warp_gi.kernels import light_connections, samples, surface, types
 from warp_gi.kernels.emitters import LightChoice
 from warp_gi.kernels.sampling import EMITTER_DIMENSION, PATH_DIMENSION, VERTEX_DIMENSIONS, random_1d

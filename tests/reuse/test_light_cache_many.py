@@ -20,10 +20,10 @@ from light_cache_tools import (
     random_cache,
     records_of,
 )
+from scene_tools import light, quad
 from statistics_tools import device, every_device  # noqa: F401
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import light, quad
 from warp_gi.kernels import light_cache, light_cache_build, samples
 from warp_gi.launch import launch
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from parallax_tools import seen_from_anchor
 from PIL import Image
+from scene_tools import quad
 from statistics_tools import device, every_device  # noqa: F401
 
 import warp_gi as gi
@@ -23,16 +24,9 @@ from warp_gi.techniques.shared.octahedral import decode
 SIZE = (24, 16)
 PIXEL = (12, 12)
 SKY_PIXEL = (12, 0)
-GREY = gi.Material("grey", (0.6, 0.6, 0.6), specular=0.0)
 BLACK = gi.Material("black", (0.0, 0.0, 0.0), specular=0.0)
 WALL = gi.Material("wall", (0.5, 0.5, 0.5), specular=0.0)
 OCTREE = gi.SampleOctree(split=96, collapse=48)
-
-
-def quad(corner, u, v, material=GREY):
-    corner, u, v = (np.asarray(x, np.float32) for x in (corner, u, v))
-    points = np.stack([corner, corner + u, corner + u + v, corner + v])
-    return gi.Mesh(points, np.array([[0, 1, 2], [0, 2, 3]], np.int32), material)
 
 
 def yard(moves=False):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import statistics_tools as st
+from scene_tools import quad, sphere
 from statistics_tools import every_device  # noqa: F401
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import sphere
 from warp_gi.errors import BakeError, OptionError
 from warp_gi.launch import set_threads
 from warp_gi.techniques.reuse.sample_octree import MOST_VERTICES
@@ -17,15 +17,8 @@ SIZE = (24, 16)
 SPP = 8
 OCTREE = gi.SampleOctree(split=192, collapse=96)
 TERMS = ("environment", "emitters", "indirect")
-GREY = gi.Material("grey", (0.7, 0.6, 0.5), specular=0.0)
 GLOSSY = gi.Material("glossy", (0.9, 0.7, 0.4), metallic=1.0, roughness=0.3)
 COATED = gi.Material("coated", (0.3, 0.5, 0.7), roughness=0.5)
-
-
-def quad(corner, u, v, material=GREY):
-    corner, u, v = (np.asarray(x, np.float32) for x in (corner, u, v))
-    points = np.stack([corner, corner + u, corner + u + v, corner + v])
-    return gi.Mesh(points, np.array([[0, 1, 2], [0, 2, 3]], np.int32), material)
 
 
 def lamp(x, y, z, color, size=0.2):

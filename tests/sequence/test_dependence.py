@@ -8,6 +8,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import statistics_tools as st
+from scene_tools import quad
 
 import warp_gi as gi
 from warp_gi import launch
@@ -20,12 +21,6 @@ SIZE = (24, 16)
 FRAMES = 5
 FIELD = gi.VisibilityField(cell_size=0.5, resolution=16, samples=2000, rays=64)
 PROBES = gi.LightFieldProbes(counts=(2, 1, 2), resolution=16, irradiance_resolution=8, rays=1, bounces=2, update=2)
-
-
-def quad(corner, u, v, material):
-    corner, u, v = (np.asarray(x, np.float32) for x in (corner, u, v))
-    points = np.stack([corner, corner + u, corner + u + v, corner + v])
-    return gi.Mesh(points, np.array([[0, 1, 2], [0, 2, 3]], np.int32), material)
 
 
 def yard(moving):

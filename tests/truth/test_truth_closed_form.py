@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import statistics_tools as st
-from scene_tools import loss_by_depth
+from scene_tools import light, loss_by_depth, quad, sphere
 from statistics_tools import every_device  # noqa: F401
 from truth_tools import (
     ALBEDO,
@@ -25,7 +25,6 @@ from truth_tools import (
 )
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import light, quad, sphere
 
 WHITE_MAP = np.ones((8, 16, 3), dtype=np.float32)
 SKIES = {"constant": (1.0, 1.0, 1.0), "map": gi.Environment(pixels=WHITE_MAP)}

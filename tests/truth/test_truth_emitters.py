@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import statistics_tools as st
 import warp as wp
+from scene_tools import quad
 from statistics_tools import every_device  # noqa: F401
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import quad
 from warp_gi.kernels.emitters import sample_emitter
 from warp_gi.kernels.path_samplers import AliasLights, alias_light
 from warp_gi.kernels.sampling import sample_2d

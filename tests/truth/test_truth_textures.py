@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import statistics_tools as st
+from scene_tools import quad
 from statistics_tools import every_device  # noqa: F401
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import quad
 
 WRAPS = ("repeat", "clamp", "mirror")
 SIZE = (60, 40)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import statistics_tools as st
+from scene_tools import quad
 from statistics_tools import every_device  # noqa: F401
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import quad
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.techniques.visibility_field import audit as visibility_audit
 

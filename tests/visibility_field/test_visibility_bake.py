@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import warp as wp
+from scene_tools import quad
 from statistics_tools import device, every_device  # noqa: F401
 
 import warp_gi as gi
@@ -80,12 +81,6 @@ def trace_hinted(
     i = first + wp.tid()
     found[i] = bvh_occluder(bvh, origins[i], directions[i], limits[i], hints[i])
     plain[i] = bvh_occluded(bvh, origins[i], directions[i], limits[i])
-
-
-def quad(corner, u, v, material=None):
-    corner, u, v = (np.asarray(x, np.float32) for x in (corner, u, v))
-    points = np.stack([corner, corner + u, corner + u + v, corner + v])
-    return gi.Mesh(points, np.array([[0, 1, 2], [0, 2, 3]], np.int32), material or gi.Material())
 
 
 def box(half):

@@ -7,22 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import statistics_tools as st
+from scene_tools import quad, sphere
 from statistics_tools import every_device  # noqa: F401
 
 import warp_gi as gi
-from warp_gi.bench.harness.presets import sphere
 from warp_gi.errors import BakeError, OptionError
 from warp_gi.launch import set_threads
 from warp_gi.scene import harmonics
 
 SIZE = (32, 24)
 SMALL = {"cell_size": 0.25, "resolution": 24, "samples": 4000, "rays": 128}
-
-
-def quad(corner, u, v, material):
-    corner, u, v = (np.asarray(x, np.float32) for x in (corner, u, v))
-    points = np.stack([corner, corner + u, corner + u + v, corner + v])
-    return gi.Mesh(points, np.array([[0, 1, 2], [0, 2, 3]], np.int32), material)
 
 
 def courtyard(environment=(1.0, 0.8, 0.6), glossy=False, **settings):

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from warp_gi.bench.harness import diff, records, runner, tables
+from warp_gi.bench.harness import catalogue, diff, records, runner, tables
 from warp_gi.bench.harness.gallery import Gallery, PictureSet
 from warp_gi.cli.options import flag, parse_options
 from warp_gi.cli.report import print_table, start_warp
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str]) -> int:
         return _run(options)
     else:
         others = [(ALL, "Every suite in turn."), ("compare", "Pipelines on a scene of your own; see its --help.")]
-        print_table("suites", ("name", "what it measures"), [*sorted(runner.suites().items()), *others])
+        print_table("suites", ("name", "what it measures"), [*sorted(catalogue.suites().items()), *others])
     return 0
 
 
@@ -142,7 +142,7 @@ def _run_all(options: Bench) -> int:
 def _start(options: Bench) -> None:
     start_warp(options.device, options.threads)
     for path in (options.html, options.json):
-        if path not in (None, Path("-")) and options.suite in (*runner.suites(), ALL):
+        if path not in (None, Path("-")) and options.suite in (*catalogue.suites(), ALL):
             check_writable(path.absolute().parent)
 
 

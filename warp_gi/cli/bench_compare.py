@@ -96,7 +96,7 @@ def _write(options: CompareBench, rows: list[records.Row], found: compare.Compar
     if options.json == Path("-"):
         print(runner.json_lines(NAME, rows, False, options.device), end="")
     else:
-        tables.print_rows("", [row for row in rows if row["table"] != compare_rows.SERIES])
+        tables.print_rows(NAME, [row for row in rows if row["table"] != compare_rows.SERIES], is_titled=False)
     if options.json is not None and options.json != Path("-"):
         runner.write_json_lines(options.json, NAME, rows, False, options.device)
         print(f"rows: {options.json}")

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 import warp_gi as gi
-from warp_gi import launch
-from warp_gi.bench.harness import places, presets, scatter
+from warp_gi.bench.harness import places, scatter, scenes
 from warp_gi.bench.harness.measure import Row, Taken, in_process, peak_memory, take_turns
 from warp_gi.bench.harness.stages import LAMBERT, Case, timed_bake
 from warp_gi.bench.peers import mitsuba_peer
-from warp_gi.bench.suites import path, rays
 from warp_gi.bench.suites.dvf.views import CASES, QUICK_CASES, QUICK_SETTINGS, QUICK_SIZE, SIZE
+from warp_gi.bench.suites.path import suite as path
+from warp_gi.bench.suites.rays import suite as rays
 from warp_gi.bvh import TriangleBvh
 from warp_gi.scene import harmonics
 
@@ -56,7 +56,7 @@ def smooth_sky(height: int = 64) -> gi.Environment:
 
 def sharp_sky() -> gi.Environment:
     """Return the courtyard, scaled to mean radiance 1."""
-    sky = gi.Environment.load(presets.SCENES / places.COURTYARD)
+    sky = gi.Environment.load(scenes.SCENES / places.COURTYARD)
     return replace(sky, scale=1.0 / float(sky.mean_radiance.mean()))
 
 
@@ -70,7 +70,7 @@ def equal_error_rows(quick: bool, device: str) -> list[Row]:
             if why := place.missing or (places.missing([places.COURTYARD]) if name == "courtyard" else ""):
                 rows.append({"table": "equal error", "case": place.name, "sky": name, "skipped": why})
                 continue
-            scene = presets.peer_scene(place.scene(), diffuse=True, masks=False, emission=False)
+            scene = scenes.peer_scene(place.scene(), diffuse=True, masks=False, emission=False)
             scene = gi.Scene(scene.nodes, [], sky(), scene.cameras, scene.name)
             rows += equal_error(place, scene, name, place.camera().at_resolution(*size), device, repetitions)
     return rows
@@ -175,7 +175,7 @@ def bake_rate(
     timed_bake(scene, replace(field, samples=1), device, camera.at_resolution(16, 9))  # compiles
     bake, (wall, cpu) = timed_bake(scene, field, device, camera)
     traced = bake.counts["rays_traced"]
-    row: Row = {"table": "bake rate", "case": name, "threads": launch.thread_count(), "cells": bake.counts["cells"]}
+    row: Row = {"table": "bake rate", "case": name, "cells": bake.counts["cells"]}
     row |= {"rays asked": bake.counts["rays"], "rays traced": traced, "wall s": wall, "cpu s": cpu}
     row |= {"Mrays/wall s": traced / wall / 1e6, "raw Mrays/wall s": count / raw_wall / 1e6}
     row |= {"Mrays/cpu s": traced / max(cpu, 1e-9) / 1e6, "raw Mrays/cpu s": count / raw_cpu / 1e6}

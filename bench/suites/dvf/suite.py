@@ -14,20 +14,20 @@ from warp_gi.bench.harness.gallery import CLOSED, Gallery, PictureSet, run_parts
 from warp_gi.bench.harness.measure import Row, Taken, attempt, ratios
 from warp_gi.bench.harness.stages import Case, race, rmse
 from warp_gi.bench.suites.dvf import peers as dvf_peers
-from warp_gi.bench.suites.dvf.views import CASES, QUICK_CASES, QUICK_SIZE, SIZE, FieldStage, View, glossy, quality
+from warp_gi.bench.suites.dvf.views import CASES, QUICK_CASES, QUICK_SIZE, SIZE, FieldStage, FieldView, glossy, quality
 
 SPP = 64
 CARD = "RTX 3080"
 PAPER = {"mode": "paper", "sky": "harmonics", "resolution": 18, "rays": 128, "dilation": 1, "samples": 10_000_000}
-"""What the paper bakes and does."""
+"""The paper's settings."""
 QUICK_SAMPLES = 400_000
-"""Of them, in the quick form."""
+"""Surface samples that the quick form bakes with the paper's settings."""
 PAPER_MS = {16: (6.69, 2.23), 32: (13.79, 4.02), 64: (27.28, 7.81), 128: (55.19, 15.74)}
-"""Sponza at 1920x1080, its table 1: milliseconds of a frame without and with the field."""
+"""The paper's table 1, Sponza at 1920x1080: milliseconds of a frame without and with the field, by samples a pixel."""
 PAPER_GLOSSY_MS = {"Sponza": (54.64, 10.14), "Bistro": (48.75, 27.16)}
-"""Its section 6 and figure 10."""
+"""Milliseconds without and with the field on glossy surfaces: the paper's section 6 and figure 10."""
 PAPER_KB = {"Sponza": 49_008, "Bistro": 173_958}
-"""Of its dense fields, with cells of 0.5 and 1 m."""
+"""Size of the paper's dense fields, with cells of 0.5 and 1 m."""
 MODES: dict[str, dict[str, Any]] = {
     "three_state": {"mode": "three_state"},
     "paper": {"mode": "paper", "sky": "harmonics"},
@@ -62,7 +62,7 @@ def place_rows(place: Case, quick: bool, device: str, gallery: Gallery = CLOSED)
     if place.missing:
         return [{"table": "modes", "case": place.name, "skipped": place.missing}]
     camera = place.camera().at_resolution(*(QUICK_SIZE if quick else SIZE))
-    view, repetitions = View(place.scene(), camera, device, **place.settings), 2 if quick else 7
+    view, repetitions = FieldView(place.scene(), camera, device, settings=place.settings), 2 if quick else 7
     rows = mode_rows(place.name, view, repetitions, place.target, quick, gallery)
     if place.name in PAPER_KB:
         rows += sample_count_rows(place.name, view, repetitions, quick)
@@ -82,7 +82,7 @@ def _faster(taken: Mapping[str, Taken[Any]], name: str) -> Row:
 
 
 def mode_rows(
-    name: str, view: View, repetitions: int, target: float, quick: bool = False, gallery: Gallery = CLOSED
+    name: str, view: FieldView, repetitions: int, target: float, quick: bool = False, gallery: Gallery = CLOSED
 ) -> list[Row]:
     """Return a row for each mode at 64 samples a pixel, and one for all as in the paper."""
     stages: dict[str, FieldStage] = {"traced": view.stage(SPP, mode="traced")}
@@ -99,7 +99,7 @@ def mode_rows(
     return rows
 
 
-def sample_count_rows(name: str, view: View, repetitions: int, quick: bool) -> list[Row]:
+def sample_count_rows(name: str, view: FieldView, repetitions: int, quick: bool) -> list[Row]:
     """Return table 1: seconds with and without the field by samples a pixel, with our defaults and the paper's."""
     rows: list[Row] = []
     for spp in (16, 64) if quick else PAPER_MS:
@@ -118,7 +118,7 @@ def sample_count_rows(name: str, view: View, repetitions: int, quick: bool) -> l
     return rows
 
 
-def glossy_rows(name: str, view: View, repetitions: int) -> list[Row]:
+def glossy_rows(name: str, view: FieldView, repetitions: int) -> list[Row]:
     """Return figure 10: the scene with every surface coated, in two modes, and what the paper says of it."""
     shiny, rows = view.with_scene(glossy(view.scene)), []
     stages = {"traced": shiny.stage(SPP, mode="traced")}
@@ -132,7 +132,7 @@ def glossy_rows(name: str, view: View, repetitions: int) -> list[Row]:
     return [*rows, paper | {"with ms": with_, "paper ratio": without / with_}]
 
 
-def sweep_rows(view: View, repetitions: int, quick: bool, spp: int = SPP) -> list[Row]:
+def sweep_rows(view: FieldView, repetitions: int, quick: bool, spp: int = SPP) -> list[Row]:
     """Return a row for each value of the settings that the paper varies, and of the resolution of the masks."""
     numbers = (80_000, 400_000, 2_000_000, 10_000_000, 0)
     sizes, resolutions = (0.5, 1.0, 2.0, 4.0), (36, 48, 72, 84, 96)

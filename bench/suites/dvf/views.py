@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.bench.harness.measure import Row, Times
-from warp_gi.bench.harness.stages import DARK, LAMBERT, Case, Stage, rmse, timed_bake
+from warp_gi.bench.harness.measure import Row
+from warp_gi.bench.harness.stages import DARK, LAMBERT, Case, Stage, View, rmse
 from warp_gi.techniques.visibility_field import audit as visibility_audit
 from warp_gi.techniques.visibility_field.state import FieldState
 
@@ -21,10 +22,10 @@ CASES = (
     Case("street_white", "street", 2.0, {"cell_size": 1.0}, DARK),
 )
 QUICK_SETTINGS = {"cell_size": 4.0, "resolution": 36}
-"""Of fields that bake in seconds, and save less."""
+"""Settings of fields that bake in seconds, and save less."""
 QUICK_CASES = tuple(replace(case, settings=QUICK_SETTINGS) for case in (CASES[0], CASES[3]))
 SIZE, QUICK_SIZE = (480, 270), (160, 90)
-"""Of pictures."""
+"""Picture size in pixels."""
 
 
 def glossy(scene: gi.Scene) -> gi.Scene:
@@ -53,31 +54,21 @@ class FieldStage(Stage):
         return self.state.masks.nbytes + self.state.slots.nbytes
 
 
-class View:
-    """A scene and a camera; bakes what the camera sees once for each setting that a bake depends on."""
+@dataclass
+class FieldView(View):
+    """A view of visibility fields."""
 
-    def __init__(self, scene: gi.Scene, camera: gi.Camera, device: str = "cpu", **settings: Any) -> None:
-        self.scene, self.camera, self.device, self.settings = scene, camera, device, settings
-        self.bakes: dict[str, gi.Bake] = {}
-        self.bake_seconds: dict[str, Times] = {}
-        self._cells: dict[float, int] = {}
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of its fields that are not the defaults."""
+    _cells: dict[float, int] = field(default_factory=dict)
 
     def estimator(self, **settings: Any) -> gi.VisibilityField:
         """Return this view's field with other ``settings``."""
         return gi.VisibilityField(**{**self.settings, **settings})
 
-    def with_scene(self, scene: gi.Scene) -> View:
+    def with_scene(self, scene: gi.Scene) -> FieldView:
         """Return this view of a scene of the same geometry; the bakes are shared."""
-        view = View(scene, self.camera, self.device, **self.settings)
-        view.bakes, view.bake_seconds = self.bakes, self.bake_seconds
-        return view
-
-    def bake(self, estimator: gi.VisibilityField) -> tuple[gi.Bake, Times]:
-        """Return the bake and what it took, compilation apart."""
-        key = repr(estimator.bake_settings(self.scene))
-        if key not in self.bakes:
-            self.bakes[key], self.bake_seconds[key] = timed_bake(self.scene, estimator, self.device, self.camera)
-        return self.bakes[key], self.bake_seconds[key]
+        return replace(self, scene=scene)
 
     def stage(self, spp: int, **settings: Any) -> FieldStage:
         """Return the stage at ``spp`` samples a pixel."""

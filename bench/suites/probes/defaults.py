@@ -15,14 +15,14 @@ from warp_gi.bench.harness.gallery import CLOSED, Gallery, PictureSet
 from warp_gi.bench.harness.measure import Row
 from warp_gi.bench.harness.stages import Case, Stage, race
 from warp_gi.bench.suites.probes.irradiance import of_probes, path_traced
-from warp_gi.bench.suites.probes.views import SEED, View, counts_of, mean_squared, room_views, view_of
+from warp_gi.bench.suites.probes.views import SEED, ProbeView, counts_of, mean_squared, room_views, view_of
 
 TERM_TABLE = "default settings, the scenes' own materials"
 DARK_TABLE = "default settings: dark room of two"
 IRRADIANCE_TABLE = "default settings: irradiance at first hits"
 MODES = ("irradiance", "hybrid")
 SPP = 16
-"""That a pipeline has unless told otherwise; where too few probes see a point, the mode "irradiance" traces them."""
+"""Samples a pixel, a pipeline's default; the mode "irradiance" traces them only where too few probes see a point."""
 MOST_BAKE = 40.0
 """CPU seconds that a bake may take."""
 DARK_TARGETS = {"probes": 0.015, "exact": 0.006}
@@ -71,7 +71,9 @@ def default_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Ro
     return sorted(rows, key=lambda row: (TERM_TABLE, DARK_TABLE, IRRADIANCE_TABLE).index(row["table"]))
 
 
-def term_rows(case: DefaultCase, view: View, repetitions: int, gallery: Gallery = CLOSED, **settings: Any) -> list[Row]:
+def term_rows(
+    case: DefaultCase, view: ProbeView, repetitions: int, gallery: Gallery = CLOSED, **settings: Any
+) -> list[Row]:
     """Return the rows of the indirect term, one a mode; ``settings`` are those of the probes that are not defaults."""
     stages = {mode: view.stage(SPP, mode=mode, **settings) for mode in MODES}
     taken = race(stages, repetitions, view.device)
@@ -101,7 +103,7 @@ def black_share(picture: np.ndarray, reference: np.ndarray) -> float:
     return float((lit & (picture.max(axis=-1) <= 0)).mean())
 
 
-def dark_rows(views: dict[str, View], **settings: Any) -> list[Row]:
+def dark_rows(views: dict[str, ProbeView], **settings: Any) -> list[Row]:
     """Return the light of the dark room over that of the lit one, in one bake for both, by who tells what is seen."""
     rows: list[Row] = []
     paths = float(views["lit"].reference.mean(dtype=np.float64))
@@ -114,7 +116,7 @@ def dark_rows(views: dict[str, View], **settings: Any) -> list[Row]:
     return rows
 
 
-def irradiance_rows(case: DefaultCase, view: View, **settings: Any) -> list[Row]:
+def irradiance_rows(case: DefaultCase, view: ProbeView, **settings: Any) -> list[Row]:
     """Return what the probes say of the irradiance where camera rays end, where they say something."""
     stage = view.stage(1, mode="irradiance", **settings)
     halves = [path_traced(stage, max(view.reference_spp // 2, 1), SEED + 11 + half) for half in range(2)]

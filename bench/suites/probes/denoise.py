@@ -13,7 +13,7 @@ from warp_gi.bench.harness.stages import LAMBERT, Case
 from warp_gi.errors import OptionError
 
 FRAME = 7
-"""That is judged; the frames before it are what the denoiser remembers."""
+"""Frame that is judged; the denoiser remembers those before it."""
 RAYS = (1, 2, 8)
 DENOISERS = {"spatiotemporal": "ST", "oidn": "OIDN"}
 

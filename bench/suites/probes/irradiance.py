@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from warp_gi.bench.harness.presets import REFERENCE_DEPTH
+from warp_gi.bench.harness.scenes import REFERENCE_DEPTH
 from warp_gi.bench.harness.stages import Stage
 from warp_gi.kernels.bsdf import lambert
 from warp_gi.kernels.bvh import BvhHit

@@ -16,7 +16,7 @@ from warp_gi.bench.suites.probes.views import (
     LIVING_ROOM,
     ROOM,
     SPONZA,
-    View,
+    ProbeView,
     counts_of,
     room_views,
     view_of,
@@ -24,9 +24,9 @@ from warp_gi.bench.suites.probes.views import (
 from warp_gi.techniques.light_field.places import lit_data
 
 SPP = 4
-"""Of the modes that trace rays."""
+"""Samples a pixel of the modes that trace rays."""
 PATH_SPP = 16
-"""That the path tracer's time and noise a sample are measured with."""
+"""Samples a pixel with which the path tracer's time and noise a sample are measured."""
 QUICK_GRIDS = 1
 """Places whose light the quick form measures."""
 RESOLUTION = 128
@@ -47,7 +47,7 @@ PAPER_MS = (
     ("Luxury Kitchen", "4 x 4 x 4", 1024, 0.358, 9.334),
     ("San Miguel", "8 x 2 x 8", 1024, 0.520, 47.170),
 )
-"""Its table 1: milliseconds at 1920x1080 for the Lambertian and the glossy term."""
+"""The paper's table 1: milliseconds at 1920x1080 for the Lambertian and the glossy term."""
 PAPER_BAKE = "60 to 120 s"
 
 
@@ -71,7 +71,7 @@ def leak_rows(quick: bool, device: str) -> list[Row]:
     return rows
 
 
-def _leak_row(views: dict[str, View], settings: dict[str, Any]) -> Row:
+def _leak_row(views: dict[str, ProbeView], settings: dict[str, Any]) -> Row:
     means = {name: view.stage(1, mode="irradiance", **settings) for name, view in views.items()}
     lit, dark = (float(means[name].picture.mean(dtype=np.float64)) for name in ("lit", "dark"))
     paths = float(views["lit"].reference.mean(dtype=np.float64))
@@ -85,7 +85,7 @@ def covered(stage: Stage) -> int:
     return int((stage.state.field.states.numpy() != 0).sum())
 
 
-def darkened(view: View, stage: Stage) -> Row:
+def darkened(view: ProbeView, stage: Stage) -> Row:
     """Return the share of what is seen whose indirect light is less than half, and more than twice, what it should be.
 
     In blocks of 8 x 8 pixels, in which the path tracer's noise is small.
@@ -137,7 +137,7 @@ def _grids(*counts: tuple[int, int, int]) -> list[dict[str, Any]]:
 
 
 def mode_rows(
-    place: Case, view: View, grids: list[dict[str, Any]], repetitions: int, gallery: Gallery = CLOSED
+    place: Case, view: ProbeView, grids: list[dict[str, Any]], repetitions: int, gallery: Gallery = CLOSED
 ) -> list[Row]:
     """Return rows of one place: of each mode and grid, beside the path tracer at equal time and equal error.
 
@@ -190,7 +190,7 @@ def bake_rows(quick: bool, device: str) -> list[Row]:
     return [*rows, {"table": f"bakes: paper, {PAPER_CARD}", "all its scenes": PAPER_BAKE}]
 
 
-def bake_row(place: Case, view: View, resolution: int) -> Row:
+def bake_row(place: Case, view: ProbeView, resolution: int) -> Row:
     """Return the row of one bake with 4 x 4 x 4 probes."""
     settings = gi.LightFieldProbes(counts=(4, 4, 4), resolution=resolution)
     bake, (wall, cpu) = view.bake(settings)

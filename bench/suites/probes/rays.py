@@ -13,16 +13,16 @@ import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench.harness.measure import Row, median_and_spread, ratio_and_spread
 from warp_gi.bench.harness.stages import Case, race
-from warp_gi.bench.suites.probes.views import CORNELL, LIVING_ROOM, SPONZA, View, view_of
+from warp_gi.bench.suites.probes.views import CORNELL, LIVING_ROOM, SPONZA, ProbeView, view_of
 from warp_gi.kernels import light_field_march as march_kernels
 from warp_gi.techniques.light_field.ray import march_rays
 
 SHARE, METRES = 0.02, 0.05
-"""Of distance, and of space, within which hits agree; the larger one counts."""
+"""Hits agree within this share of their distance or this many metres, whichever is more."""
 CASE = (4, 4, 4), 256
 RESOLUTIONS = (64, 256, 1024)
 COUNTS = ((1, 4, 1), (4, 4, 4), (8, 4, 8))
-"""As in the paper's figures 18 and 19."""
+"""Probes along x, y and z, as in the paper's figures 18 and 19."""
 RAYS = 100_000
 
 
@@ -37,7 +37,7 @@ def ray_rows(quick: bool, device: str) -> list[Row]:
     return rows
 
 
-def place_rows(place: Case, view: View, quick: bool, count: int = RAYS) -> list[Row]:
+def place_rows(place: Case, view: ProbeView, quick: bool, count: int = RAYS) -> list[Row]:
     """Return the rows of one place: the resolution varies with the paper's counts, the counts with its default."""
     (counts, resolution), grids = CASE, []
     for size in RESOLUTIONS[:2] if quick else RESOLUTIONS:
@@ -49,7 +49,7 @@ def place_rows(place: Case, view: View, quick: bool, count: int = RAYS) -> list[
     return [ray_row(place, view, rays, *grid, 1 if quick else 3) for grid in grids]
 
 
-def surface_rays(view: View, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def surface_rays(view: ProbeView, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return float32 [ray, 3] origins, just off a surface, and unit directions; fewer than asked if many get lost."""
     rng = np.random.default_rng(seed)
     ways = view.camera.directions(rng.uniform(size=(count, 2)) * view.camera.resolution)
@@ -64,7 +64,7 @@ def surface_rays(view: View, count: int, seed: int = 0) -> tuple[np.ndarray, np.
 
 
 def bounced(
-    view: View, origins: np.ndarray, directions: np.ndarray, rng: np.random.Generator
+    view: ProbeView, origins: np.ndarray, directions: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return rays that go on from where others hit, cosine-distributed about the normal; fewer if some hit nothing."""
     hits = view.scene.bvh(view.device).intersect(origins.astype(np.float32), directions.astype(np.float32))
@@ -84,7 +84,7 @@ def bounced(
 
 def ray_row(
     place: Case,
-    view: View,
+    view: ProbeView,
     rays: tuple[np.ndarray, np.ndarray],
     counts: tuple[int, int, int],
     resolution: int,

@@ -11,8 +11,8 @@ import numpy as np
 import warp_gi as gi
 from warp_gi.bench.harness.measure import Row, Times
 from warp_gi.bench.harness.places import PLACES
-from warp_gi.bench.harness.presets import REFERENCE_DEPTH
-from warp_gi.bench.harness.stages import LAMBERT, PLAIN, Case, Stage, timed_bake
+from warp_gi.bench.harness.scenes import REFERENCE_DEPTH
+from warp_gi.bench.harness.stages import LAMBERT, PLAIN, Case, Stage, View
 from warp_gi.metrics import RELATIVE_EPSILON
 
 SEED = 7
@@ -27,24 +27,11 @@ SPONZA = Case("sponza", target=50.0, materials=LAMBERT)
 
 
 @dataclass
-class View:
-    """A scene from a camera on a device. Bakes and the path tracer's pictures are made once."""
+class ProbeView(View):
+    """A view of light field probes, with the path tracer's pictures to compare them with, which are made once."""
 
-    scene: gi.Scene
-    camera: gi.Camera
-    device: str = "cpu"
     reference_spp: int = 64
-    path: gi.CameraPath | None = None
-    """What its bakes are for, if more than the camera."""
-    bakes: dict[str, tuple[gi.Bake, Times]] = field(default_factory=dict)
     _halves: list[np.ndarray] = field(default_factory=list)
-
-    def bake(self, estimator: gi.LightFieldProbes) -> tuple[gi.Bake, Times]:
-        """Return the bake and what it took, compilation apart."""
-        key = repr(estimator.bake_settings(self.scene))
-        if key not in self.bakes:
-            self.bakes[key] = timed_bake(self.scene, estimator, self.device, self.path or self.camera)
-        return self.bakes[key]
 
     def stage(self, spp: int, **settings: Any) -> Stage:
         """Return the stage of probes at ``spp`` samples a pixel."""
@@ -84,18 +71,18 @@ class View:
         }
 
 
-def view_of(place: Case, size: tuple[int, int], device: str, reference_spp: int) -> View:
+def view_of(place: Case, size: tuple[int, int], device: str, reference_spp: int) -> ProbeView:
     """Return the view of a place at a size in pixels."""
-    return View(place.scene(), place.camera().at_resolution(*size), device, reference_spp)
+    return ProbeView(place.scene(), place.camera().at_resolution(*size), device, reference_spp=reference_spp)
 
 
-def room_views(size: tuple[int, int], device: str, reference_spp: int) -> dict[str, View]:
+def room_views(size: tuple[int, int], device: str, reference_spp: int) -> dict[str, ProbeView]:
     """Return the views of the rooms "lit" and "dark" of two; what one bakes, for both cameras, the other has too."""
     rooms = {"lit": PLACES["two_rooms"], "dark": PLACES["two_rooms_dark"]}
     scene = rooms["lit"].scene()
     cameras = {name: room.camera().at_resolution(*size) for name, room in rooms.items()}
     path, bakes = gi.CameraPath.from_cameras(cameras.values()), dict[str, tuple[gi.Bake, Times]]()
-    return {name: View(scene, camera, device, reference_spp, path, bakes) for name, camera in cameras.items()}
+    return {name: ProbeView(scene, camera, device, path, bakes, reference_spp) for name, camera in cameras.items()}
 
 
 def mean_squared(values: np.ndarray, halves: Sequence[np.ndarray], relative: bool = False) -> float:

@@ -13,7 +13,7 @@ from warp_gi.bench.suites.reuse.views import MINE, WAREHOUSE, FrameRun, Truth, r
 
 CARD = "RTX 2080 Ti, 1920x1080"
 TARGET_SHARE = 0.08
-"""Of a frame, for all preprocessing."""
+"""Share of a frame that all preprocessing may take."""
 PAPER_PASSES = (
     ("octree: mark, adapt, augment, allocate", 0.2),
     ("cache: deduplicate", 0.2),

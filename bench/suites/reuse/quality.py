@@ -46,7 +46,7 @@ OURS = (
     "VisibilityLightCache + GuidedPaths",
 )
 WORST = 1.2
-"""Times the baseline's error that no combination of ours exceeds."""
+"""Ratio to the baseline's error that no combination of ours should exceed."""
 PAPER = (
     ("(a) warehouse", "VLC: almost one order of magnitude below SLL and LH; CDQ: no real benefit"),
     ("(b) mine", "VLC: useless, its NEE has no sky; CDQ: much below BRDF sampling where the sun's spot lights"),

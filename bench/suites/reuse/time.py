@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 import warp_gi as gi
-from warp_gi.bench.harness import presets
+from warp_gi.bench.harness import scenes
 from warp_gi.bench.harness.measure import Row
 from warp_gi.bench.harness.stages import Case
 from warp_gi.bench.suites.reuse.views import (
@@ -102,7 +102,7 @@ def turn_rows(
 ) -> list[Row]:
     """Return rows of one angle; the light turns after the first of the two numbers of ``frames``."""
     before, after = frames
-    scene, camera = presets.guiding_ring(turn, before), RING.camera().at_resolution(*size)
+    scene, camera = scenes.guiding_ring(turn, before), RING.camera().at_resolution(*size)
     truths = [Truth(scene, camera, device, spp, index) for index in (before - 1, before)]
     choices = {"baseline": _pipeline(gi.LightHierarchy(), gi.BsdfPaths())}
     for count in bits:
@@ -147,7 +147,7 @@ def strobe_rows(quick: bool, device: str) -> list[Row]:
         "baseline": _pipeline(gi.LightHierarchy(), gi.BsdfPaths()),
     }
     rows: list[Row] = []
-    for kind in ("jump",) if quick else tuple(presets.STROBE_PERIODS):
+    for kind in ("jump",) if quick else tuple(scenes.STROBE_PERIODS):
         series = strobe_series(kind, choices, size, spp, cycles, device)
         rows += [row for name in choices for row in strobe_kind_rows(kind, name, series)]
     return rows
@@ -157,12 +157,12 @@ def strobe_series(
     kind: str, choices: dict[str, gi.Pipeline], size: tuple[int, int], spp: int, cycles: int, device: str
 ) -> dict[str, np.ndarray]:
     """Return the beauty's errors by frame of the period, mean over ``cycles`` of them after a first."""
-    period = presets.STROBE_PERIODS[kind]
-    scene, camera = presets.strobe(kind), STROBE.camera().at_resolution(*size)
+    period = scenes.STROBE_PERIODS[kind]
+    scene, camera = scenes.strobe(kind), STROBE.camera().at_resolution(*size)
     make, truths = partial(Truth, scene, camera, device, spp), {}
 
     def truth(index: int) -> Truth:
-        return truths.setdefault(presets.strobe_place(kind, index), make(index))
+        return truths.setdefault(scenes.strobe_place(kind, index), make(index))
 
     runs = run_sequences(scene, camera, choices, period * (cycles + 1), truth, device)
     return {name: _by_phase(run, period) for name, run in runs.items()}

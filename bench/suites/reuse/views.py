@@ -9,13 +9,14 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi.bench.harness.measure import Row, Times, cost, timed
-from warp_gi.bench.harness.presets import REFERENCE_DEPTH
+from warp_gi.bench.harness.scenes import REFERENCE_DEPTH
 from warp_gi.bench.harness.stages import Case
+from warp_gi.bench.suites.reuse.columns import TERMS
 
-MEASURED = ("emitters", "indirect", "beauty")
+MEASURED = TERMS
 SEED = 11
 TOLERANCE = 1.2
-"""Times the settled error: within it, a sequence has settled."""
+"""A sequence has settled where its error stays below the settled error times this."""
 _NOT_OF_A_FRAME = ("bake", "compile", "scene")
 
 
@@ -50,7 +51,7 @@ class Truth:
     spp: int = 64
     frame: int = 0
     settings: Mapping[str, int] = field(default_factory=dict)
-    """Of the paths."""
+    """Settings of the paths."""
     _halves: list[dict[str, np.ndarray]] = field(default_factory=list)
 
     @property
@@ -94,7 +95,7 @@ class FrameRun:
     errors: dict[str, list[float]] = field(default_factory=lambda: {term: [] for term in MEASURED})
     timings: list[dict[str, float]] = field(default_factory=list)
     times: list[Times] = field(default_factory=list)
-    """Of whole frames."""
+    """Wall and CPU seconds of whole frames."""
     frame: gi.Frame | None = None
 
     def step(self, index: int, truth: Truth) -> None:

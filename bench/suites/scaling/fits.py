@@ -20,7 +20,7 @@ class Growth:
 
     exponents: list[float]
     ratios: dict[float, list[float]]
-    """By the smaller size, of those that are at most a tenth of the largest."""
+    """Ratios by the smaller size, for sizes of at most a tenth of the largest."""
 
     @staticmethod
     def of(sizes: Sequence[float], turns: Sequence[Sequence[float]]) -> Growth:

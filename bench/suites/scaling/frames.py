@@ -14,6 +14,7 @@ import warp as wp
 
 import warp_gi as gi
 from warp_gi import launch
+from warp_gi.bench.harness import catalogue
 from warp_gi.bench.harness.measure import PeakMemory, Row, Taken, ratio_and_spread, take_turns, timed
 from warp_gi.bench.harness.places import PLACES
 from warp_gi.bench.suites.scaling.fits import Growth
@@ -25,13 +26,11 @@ SHAPE = 16 / 9
 LIGHTS, QUICK_LIGHTS = (10, 100, 1_000, 10_000, 100_000), (10, 100, 1_000)
 LIGHT_SIZE, QUICK_LIGHT_SIZE = (160, 90), (80, 45)
 LIGHT_TURNS, QUICK_LIGHT_TURNS = 8, 4
-EMITTERS = {
-    "PowerLights": gi.PowerLights(),
-    "LightHierarchy": gi.LightHierarchy(),
-    "VisibilityLightCache": gi.VisibilityLightCache(),
-}
+BASELINES = {"PowerLights": gi.PowerLights(), "LightHierarchy": gi.LightHierarchy()}
+"""Ways to select lights that techniques are measured beside."""
 MEGAPIXELS, QUICK_MEGAPIXELS = (0.1, 0.3, 1.0, 2.0, 4.0, 8.0), (0.03, 0.3)
-PRESETS = ("path", "reuse")
+BASE = "path"
+"""The preset that techniques are measured beside."""
 MANY_PIXELS = 1.5
 """Megapixels from which a frame is measured once, not PIXEL_TURNS times."""
 PIXEL_TURNS = 3
@@ -41,6 +40,12 @@ THREAD_TURNS, QUICK_THREAD_TURNS = 5, 3
 
 
 # ---- lights ----
+
+
+def emitters() -> dict[str, gi.Estimator]:
+    """Return the baselines and the techniques that select lights, by name."""
+    added = [getattr(module, "EMITTERS", {}) for _, module in catalogue.modules("scaling")]
+    return {name: one for group in (BASELINES, *added) for name, one in group.items()}
 
 
 def light_rows(quick: bool, device: str) -> list[Row]:
@@ -54,7 +59,7 @@ def light_rows(quick: bool, device: str) -> list[Row]:
 def light_rows_of(counts: Sequence[int], size: tuple[int, int], turns: int, device: str) -> list[Row]:
     """Return the rows for halls of ``counts`` lights; their frames take turns."""
     camera = HALL_VIEW.at_resolution(*size)
-    pipelines = {name: gi.Pipeline.preset("path", spp=1, emitters=emitters) for name, emitters in EMITTERS.items()}
+    pipelines = {name: gi.Pipeline.preset("path", spp=1, emitters=one) for name, one in emitters().items()}
     for pipeline in pipelines.values():
         gi.FrameScheduler(lamp_hall(100), camera, pipeline, device).bake()  # loads what is needed
     schedulers: dict[tuple[str, int], gi.FrameScheduler] = {}
@@ -71,7 +76,7 @@ def light_rows_of(counts: Sequence[int], size: tuple[int, int], turns: int, devi
     for (name, count), scheduler in schedulers.items():
         rows.append({"table": "lights", "estimator": name, "lights": scheduler.scene.emitter_count})
         rows[-1] |= starts[name, count] | light_row(scheduler, taken[f"{name} {count}"])
-    for name in EMITTERS:
+    for name in pipelines:
         said = {"table": "lights: growth", "estimator": name, "what": "frame cost s"}
         rows.append(said | Growth.of(counts, [taken[f"{name} {count}"].counting for count in counts]).row())
         memory = [[row["lights MB"]] for row in rows if row.get("estimator") == name and "lights MB" in row]
@@ -124,6 +129,11 @@ def device_bytes(*values: Any) -> int:
 # ---- pixels ----
 
 
+def presets() -> list[str]:
+    """Return the names of the presets that are rendered at every size."""
+    return [BASE, *(name for _, module in catalogue.modules("scaling") for name in getattr(module, "PIPELINES", ()))]
+
+
 def pixel_rows(quick: bool, device: str) -> list[Row]:
     """Return rows of a frame at one sample a pixel by its number of pixels, and of their growth."""
     return pixel_rows_of(QUICK_MEGAPIXELS if quick else MEGAPIXELS, device)
@@ -135,7 +145,7 @@ def pixel_rows_of(sizes: Sequence[float], device: str) -> list[Row]:
     "bytes a pixel" are what the memory grows by between the two largest.
     """
     rows: list[Row] = []
-    for preset in PRESETS:
+    for preset in presets():
         seconds, peaks = [], []
         for size in sizes:
             with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:

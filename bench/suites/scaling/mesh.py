@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 import warp_gi as gi
-from warp_gi.bench.harness import presets
+from warp_gi.bench.harness import scenes
 from warp_gi.scene.builtin import shapes
 from warp_gi.scene.camera import CameraKey
 
 SIDE, HEIGHT = 12.0, 5.0
-"""Metres, of the room of the crowd."""
+"""Side and height of the crowd's room in metres."""
 BLOBS = 5
-"""Along each side of the room; there is none where the camera is."""
+"""Number of blobs along each side of the room; there is none where the camera is."""
 WALL_SHARE = 1 / 8
-"""Of the triangles."""
+"""Share of the triangles that the walls have."""
 OCTAVES = ((2.0, 0.22), (4.0, 0.12), (7.0, 0.07))
 """Frequency and amplitude of a blob's waves; even the coarsest mesh has about two vertices for each."""
 CROWD_VIEW = CameraKey(0.0, (-5.2, 2.4, 5.2), (1.5, 1.2, -1.5), hfov=75.0)
@@ -35,7 +35,7 @@ def crowd(triangles: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     count = BLOBS**2 - 1
     rows = max(round(0.5 + (0.25 + (1 - WALL_SHARE) * triangles / count / 4) ** 0.5), 3)
-    ball = presets.sphere((0.0, 0.0, 0.0), 1.0, gi.Material(), rows)
+    ball = scenes.sphere((0.0, 0.0, 0.0), 1.0, gi.Material(), rows)
     parts = [_room(max(round((WALL_SHARE * triangles / 12) ** 0.5), 1), rng)]
     for place in range(1, count + 1):  # place 0 is the camera's
         spacing = SIDE / BLOBS
@@ -102,7 +102,7 @@ def lamp_hall(lights: int, seed: int = 0) -> gi.Scene:
         points = corners[which == k].reshape(-1, 3).astype(np.float32)
         starts = 4 * np.arange(len(points) // 4)[:, None, None]
         indices = (starts + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3).astype(np.int32)
-        lamps.append(gi.Mesh(points, indices, presets.light((strength, strength, strength)), name=f"lamps {k}"))
+        lamps.append(gi.Mesh(points, indices, scenes.light((strength, strength, strength)), name=f"lamps {k}"))
     grey = gi.Material("grey", (0.6, 0.6, 0.6), specular=0.0)
     solid = [shapes.box((-x / 2, 0, -z / 2), (x / 2, y, z / 2)).flipped()]
     solid += [shapes.box((i - 0.3, 0, k - 0.3), (i + 0.3, y, k + 0.3)) for i in range(-15, 16, 6) for k in (-8, 0, 8)]

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from warp_gi.bench.harness import catalogue
 from warp_gi.bench.harness.gallery import CLOSED, Gallery, run_parts
 from warp_gi.bench.harness.measure import Row
-from warp_gi.bench.suites.scaling.bakes import probe_rows, sample_rows
 from warp_gi.bench.suites.scaling.frames import light_rows, pixel_rows, thread_rows
 from warp_gi.bench.suites.scaling.triangles import triangle_rows
 
@@ -19,9 +19,8 @@ PARTS = {
     "triangles": triangle_rows,
     "lights": light_rows,
     "pixels": pixel_rows,
-    "samples": sample_rows,
-    "probes": probe_rows,
     "threads": thread_rows,
+    **{name: part for _, module in catalogue.modules("scaling") for name, part in getattr(module, "PARTS", {}).items()},
 }
 
 

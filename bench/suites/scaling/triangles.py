@@ -11,11 +11,18 @@ from typing import Any
 import numpy as np
 
 from warp_gi import launch
-from warp_gi.bench.harness.measure import PeakMemory, Row, Taken, median_and_spread, ratio_and_spread, take_turns
-from warp_gi.bench.suites.rays import NO_EMBREE, diffuse_rays, embree_builder, primary_rays, trace
+from warp_gi.bench.harness.measure import (
+    PeakMemory,
+    Row,
+    Taken,
+    median_and_spread,
+    ratio_and_spread,
+    resident_memory,
+    take_turns,
+)
+from warp_gi.bench.suites.rays.suite import NO_EMBREE, diffuse_rays, embree_builder, primary_rays, trace
 from warp_gi.bench.suites.scaling.fits import Growth
 from warp_gi.bench.suites.scaling.mesh import CROWD_VIEW, crowd
-from warp_gi.bench.suites.sequence import resident_memory
 from warp_gi.bvh import TriangleBvh
 
 COUNTS = (10_000, 31_600, 100_000, 316_000, 1_000_000, 3_160_000, 10_000_000)
@@ -24,15 +31,15 @@ RAYS, QUICK_RAYS = 250_000, 30_000
 TURNS, QUICK_TURNS = 5, 3
 BUILDS = 3
 MOST_GROWTH, MOST_BYTES = 1.8, 120.0
-"""Time a ray for ten times the triangles, and bytes of the tree a triangle: what is aimed at."""
+"""Targets: how many times longer a ray may take with ten times the triangles, and the tree's bytes a triangle."""
 QUERIES = {"any": "OCCLUDED", "closest": "INTERSECT"}
-"""Ours and Embree's."""
+"""Queries by our name, and Embree's names of them."""
 CONTENDERS = ("ours", "embree")
 FEW, TIMES = 128, 4
 KINDS = ("primary", "diffuse", "diffuse, sorted", "diffuse, few")
-"""Of rays. Sorted ones start near those before them; "few" are FEW rays again and again, all of whose nodes stay in the
-cache: how their time grows is how the work grows, and what others grow beyond it is memory. They come TIMES in a row,
-which the tree takes as in order already."""
+"""Kinds of rays. Sorted ones start near those before them. "few" repeats FEW rays, so that all nodes stay in the cache:
+its time grows as the traversal work does; where the time of other kinds grows more, the rest is memory. Each of the few
+comes TIMES in a row, which the tree takes as in order already."""
 
 
 @dataclass

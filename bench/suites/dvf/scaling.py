@@ -1,4 +1,4 @@
-"""Bakes over their size: a visibility field's surface samples and its error, and the resolution of probes."""
+"""What visibility fields add to the suite ``scaling``: their bake and its error over the number of surface samples."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ ATRIUM = next(case for case in CASES if case.name == "atrium")
 SIZE, QUICK_SIZE = (240, 135), (48, 27)
 SPP = 16
 SAMPLES, QUICK_SAMPLES = (40_000, 160_000, 640_000, 2_560_000), (20_000, 80_000, 320_000)
-RESOLUTIONS, QUICK_RESOLUTIONS = (32, 64, 128, 256, 512), (16, 64, 160)
-COUNTS, QUICK_COUNTS = (4, 4, 4), (2, 2, 2)
 TURNS, QUICK_TURNS = 3, 2
 
 
@@ -45,26 +43,4 @@ def sample_rows_of(numbers: Sequence[int], size: tuple[int, int], turns: int, de
     return [*rows, said | {"what": "RMSE"} | Growth.of(numbers, errors).row()]
 
 
-def probe_rows(quick: bool, device: str) -> list[Row]:
-    """Return rows of light field probes by the texels along a side of their maps, and of their growth."""
-    resolutions, counts, turns = (
-        (QUICK_RESOLUTIONS, QUICK_COUNTS, QUICK_TURNS) if quick else (RESOLUTIONS, COUNTS, TURNS)
-    )
-    return probe_rows_of(resolutions, counts, turns, device)
-
-
-def probe_rows_of(resolutions: Sequence[int], counts: tuple[int, int, int], turns: int, device: str) -> list[Row]:
-    """Return the rows for probes of ``resolutions``."""
-    scene = gi.builtin_scene("cornell_box")
-    grids = {side: gi.LightFieldProbes(counts=counts, resolution=side) for side in resolutions}
-    works = {str(side): lambda _, probes=probes: gi.bake(scene, probes, device) for side, probes in grids.items()}
-    taken = take_turns(works, turns, device, keep=1, warm=False)
-    rows: list[Row] = []
-    for side in resolutions:
-        bakes = taken[str(side)]
-        row: Row = {"table": "probes", "resolution": side} | bakes.row("bake ")
-        rows.append(row | {"MB": bakes.results[0].counts["bytes"] / 1e6})
-    said = {"table": "probes: growth"}
-    cost = Growth.of(resolutions, [taken[str(side)].counting for side in resolutions]).row()
-    memory = Growth.of(resolutions, [[row["MB"]] for row in rows]).row()
-    return [*rows, said | {"what": "bake cost s"} | cost, said | {"what": "MB"} | memory]
+PARTS = {"samples": sample_rows}

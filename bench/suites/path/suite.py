@@ -183,7 +183,7 @@ def _child(place: str, size: tuple[int, int], spp: int, device: str, **variables
     if PLACES[place].missing:
         return {"skipped": PLACES[place].missing}
     started = time.time()
-    row = in_process(["warp_gi.bench.suites.path", place, *map(str, (*size, spp)), device], **variables)
+    row = in_process(["warp_gi.bench.suites.path.suite", place, *map(str, (*size, spp)), device], **variables)
     if "failed" in row:
         return row
     said = {"pixels": f"{size[0]}x{size[1]}", "spp": spp, "wall s": row.pop("finished") - started}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 import tempfile
 import time
@@ -18,23 +17,18 @@ from typing import Any
 import numpy as np
 
 from warp_gi import launch
+from warp_gi.bench.harness import catalogue, sequences
 from warp_gi.bench.harness.gallery import CLOSED, run_parts
-from warp_gi.bench.harness.measure import Row, in_process, median_and_spread, peak_memory
+from warp_gi.bench.harness.measure import Row, in_process, median_and_spread, peak_memory, resident_memory
 from warp_gi.bench.harness.places import PLACES
 from warp_gi.bench.peers import blender_peer
 from warp_gi.cli.report import Reporter, start_warp
 
 SCENE = PLACES["atrium"].source
-CASES: dict[str, tuple[str, ...]] = {
-    "path": ("--pipeline", "path"),
-    "dvf": ("--pipeline", "dvf", "--environment.cell-size", "1"),
-    "probes": ("--pipeline", "probes"),
-    "reuse": ("--pipeline", "reuse"),
-    "path, denoised": ("--pipeline", "path", "--denoise", "spatiotemporal"),
+CASES: dict[str, sequences.Sequence] = {
+    name: case for _, module in catalogue.modules("sequence") for name, case in module.CASES.items()
 }
-SMALLER: dict[str, tuple[str, ...]] = {"probes": ("--indirect.counts", "4", "4", "4", "--indirect.resolution", "64")}
-"""What the quick form adds, as its frames are too few to pay for a bake."""
-SMALLER_TITLE = "4x4x4 of 64x64"
+"""Pipelines that suites' folders add, by their names in rows."""
 MOST_POINTS = 20
 STAGES = ("preprocess", "trace", "denoise", "write")
 _OTHERS = ("bake", "compile")
@@ -46,7 +40,7 @@ class Size:
 
     frames: int
     pixels: str
-    """As 240x135."""
+    """Width and height, such as 240x135."""
     spp: int
 
 
@@ -55,9 +49,10 @@ FULL_SIZE, QUICK_SIZE = Size(500, "160x90", 4), Size(12, "160x90", 4)
 
 def pipeline_rows(name: str, quick: bool, device: str) -> list[Row]:
     """Return rows of speed, stages and memory of a case."""
-    size, smaller = (QUICK_SIZE, SMALLER.get(name, ())) if quick else (FULL_SIZE, ())
-    title = f"{name}, {SMALLER_TITLE}" if smaller else name
-    return rows_of(title, measure(SCENE, (*CASES[name], *smaller), size, device), size)
+    case = CASES[name]
+    size, smaller = (QUICK_SIZE, case.smaller) if quick else (FULL_SIZE, ())
+    title = f"{name}, {case.smaller_title}" if smaller else name
+    return rows_of(title, measure(SCENE, (*case.arguments, *smaller), size, device), size)
 
 
 def cycles_rows(quick: bool, device: str) -> list[Row]:
@@ -69,7 +64,7 @@ PARTS: dict[str, Callable[..., list[Row]]] = {
     **{name.split()[-1]: partial(pipeline_rows, name) for name in CASES},
     "cycles": cycles_rows,
 }
-QUICK_PARTS = ("path", "probes", "reuse", "cycles")
+QUICK_PARTS = (*(name.split()[-1] for name, case in CASES.items() if case.is_quick), "cycles")
 
 
 def run(quick: bool = False, device: str = "cpu", parts: Sequence[str] = ()) -> list[Row]:
@@ -103,7 +98,7 @@ def measure(scene: str, arguments: Sequence[str], size: Size, device: str) -> di
         frames = ["--frames", f"0-{size.frames - 1}", "--resolution", size.pixels, "--spp", str(size.spp)]
         output = ["--device", device, "--threads", str(launch.thread_count()), "-o", f"{folder}/f.####.exr"]
         started = time.perf_counter()
-        found = in_process(["warp_gi.bench.suites.sequence", scene, *arguments, *frames, *output])
+        found = in_process(["warp_gi.bench.suites.sequence.suite", scene, *arguments, *frames, *output])
         wall = time.perf_counter() - started
         written = len(list(Path(folder).glob("*.exr")))
     if "failed" not in found and written != size.frames:
@@ -196,15 +191,6 @@ def add_stages(sums: Row, timings: dict[str, float]) -> None:
         if name not in _OTHERS:
             kind = name.split()[0]
             sums[kind if kind in STAGES else "trace"] += seconds
-
-
-def resident_memory() -> float:
-    """Return the bytes of memory that this process has resident; the most it has had where that is not known."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-        return float(pages * os.sysconf("SC_PAGE_SIZE"))
-    except OSError:
-        return peak_memory()
 
 
 if __name__ == "__main__":

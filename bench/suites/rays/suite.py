@@ -18,7 +18,7 @@ import warp as wp
 
 from warp_gi import bvh as bvh_module
 from warp_gi import launch
-from warp_gi.bench.harness import presets
+from warp_gi.bench.harness import scenes
 from warp_gi.bench.harness.measure import Row, attempt, median_and_spread, ratio_and_spread, take_turns
 from warp_gi.bench.harness.places import PLACES, Place
 from warp_gi.bvh import TriangleBvh
@@ -246,7 +246,7 @@ def load_triangles(place: Place) -> tuple[np.ndarray, np.ndarray]:
     if not place.files:
         geometry = place.scene().data("cpu").geometry
         return geometry.points.numpy(), geometry.indices.numpy().reshape(-1, 3)
-    mesh = trimesh.load(presets.SCENES / place.files[0], force="mesh", process=False)
+    mesh = trimesh.load(scenes.SCENES / place.files[0], force="mesh", process=False)
     return np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.int32)
 
 

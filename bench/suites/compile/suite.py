@@ -55,7 +55,7 @@ def _cold_and_warm(name: str, device: str) -> Row:
     row: Row = {}
     with tempfile.TemporaryDirectory() as cache:
         for state in STATES:
-            found = in_process(["warp_gi.bench.suites.compile", name, device], WARP_CACHE_PATH=cache)
+            found = in_process(["warp_gi.bench.suites.compile.suite", name, device], WARP_CACHE_PATH=cache)
             if "failed" in found:
                 return found
             row[f"{state} s"] = found["seconds"]

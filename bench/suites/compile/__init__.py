@@ -1,0 +1,1 @@
+"""The suite ``compile``: kernel modules, compiled and loaded."""

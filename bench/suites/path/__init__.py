@@ -1,0 +1,1 @@
+"""The suite ``path``: whole pictures beside Mitsuba, first frames, memory."""

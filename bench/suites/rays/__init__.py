@@ -1,0 +1,1 @@
+"""The suite ``rays``: ray queries and tree builds beside Embree."""

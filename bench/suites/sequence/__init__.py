@@ -1,0 +1,1 @@
+"""The suite ``sequence``: whole sequences from the command to written files."""
