@@ -15,8 +15,8 @@ from warp_gi.sequence.resume import Output, Plan, SequenceRun, shots_of
 if TYPE_CHECKING:
     from warp_gi.baking import Bake
     from warp_gi.estimator import Estimator
+    from warp_gi.frame import Frame
     from warp_gi.scene.scene import Scene
-    from warp_gi.scheduler import Frame
 
 Progress = Callable[[str, float], None]
 

@@ -35,7 +35,8 @@ from warp_gi.sequence.frames import (
 from warp_gi.sequence.state import Dependence
 
 if TYPE_CHECKING:
-    from warp_gi.scheduler import Frame, FrameScheduler
+    from warp_gi.frame import Frame
+    from warp_gi.scheduler import FrameScheduler
 
 MISSING = "missing"
 PRECISIONS = ("half", "float")
@@ -285,6 +286,7 @@ class SequenceRun:
 def _why_restart(dependence: Dependence) -> str:
     """Return why every frame is rendered again where some are there already."""
     words = {"denoiser": "the denoiser"}
-    names = [words.get(name, f"the {name} light") for name in dependence.unsaved or dependence.on_past]
+    places = [name.partition(".")[0] for name in dependence.unsaved or dependence.on_past]
+    names = [words.get(place, f"the {place} light") for place in places]
     reason = "" if dependence.unsaved else "no saved state fits, and "
     return f"{reason}{' and '.join(names)} depend{'s' * (len(names) == 1)} on the frames before"
