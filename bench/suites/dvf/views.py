@@ -21,7 +21,7 @@ CASES = (
     Case("bistro_white", "Bistro", 2.0, {"cell_size": 1.0}, DARK),
     Case("street_white", "street", 2.0, {"cell_size": 1.0}, DARK),
 )
-QUICK_SETTINGS = {"cell_size": 4.0, "resolution": 36}
+QUICK_SETTINGS: dict[str, Any] = {"cell_size": 4.0, "resolution": 36}
 """Settings of fields that bake in seconds, and save less."""
 QUICK_CASES = tuple(replace(case, settings=QUICK_SETTINGS) for case in (CASES[0], CASES[3]))
 SIZE, QUICK_SIZE = (480, 270), (160, 90)
