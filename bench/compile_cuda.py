@@ -78,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _compiled(name: str, architectures: Sequence[int]) -> str:
     """Compile a module in a process of its own, and return what to print."""
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_WARNING
     kernel_modules()  # a Warp module is known once its file is imported
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:

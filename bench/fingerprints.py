@@ -13,6 +13,7 @@ import json
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import warp_gi as gi
 from warp_gi.errors import OptionError
@@ -27,7 +28,7 @@ SAMPLES = 4
 
 def pipelines() -> dict[str, gi.Pipeline]:
     """Return what is rendered, by name."""
-    small = {"spp": SAMPLES}
+    small: dict[str, Any] = {"spp": SAMPLES}
     found = {name: gi.Pipeline.preset(name, **small) for name in PRESETS}
     hierarchy, uniform = gi.LightHierarchy(), gi.UniformLights()
     field = gi.VisibilityField(mode="unbiased", cell_size=0.4)

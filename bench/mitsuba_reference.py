@@ -66,8 +66,8 @@ def reference(name: str, renderings: int, spp: int) -> tuple[np.ndarray, np.ndar
     scene = picture.scene()
     masks = any(material.alpha_cutoff is not None for material in scene.materials)
     peer, paths = to_mitsuba(scene, picture.camera()), integrator(picture.max_depth, masks)
-    images = [np.array(mi.render(peer, integrator=paths, spp=spp, seed=1000 + i)) for i in range(renderings)]
-    images = np.stack(images).astype(np.float64)
+    rendered = [np.array(mi.render(peer, integrator=paths, spp=spp, seed=1000 + i)) for i in range(renderings)]
+    images = np.stack(rendered).astype(np.float64)
     return images.mean(axis=0), images.var(axis=0, ddof=1) / renderings
 
 

@@ -155,11 +155,11 @@ def run_tests(session: Session, file: Path) -> None:
     report = session.output.with_suffix(".xml")
     report.unlink(missing_ok=True)
     kind = session.device.partition(":")[0]
-    command = [PYTHON, "-m", "pytest", "-n", "0", "-q", "-k", kind, f"--junitxml={report}", name]
+    command: list[str | Path] = [PYTHON, "-m", "pytest", "-n", "0", "-q", "-k", kind, f"--junitxml={report}", name]
     code, seconds = session.run(name, command)
     row = {"suite": "device tests", "quick": True, **session.environment, "table": "tests", "file": name}
     if report.exists():
-        counts = ElementTree.parse(report).getroot().find("testsuite").attrib
+        counts = next(ElementTree.parse(report).iter("testsuite")).attrib
         tests, bad = int(counts["tests"]), int(counts["failures"]) + int(counts["errors"])
         row |= {"passed": tests - bad - int(counts["skipped"]), "failures": bad, "skipped": int(counts["skipped"])}
         report.unlink()
@@ -174,7 +174,7 @@ def run_suite(session: Session, suite: str) -> None:
         return
     part = session.output.with_suffix(".part")
     part.unlink(missing_ok=True)
-    arguments = ["bench", suite, "--quick", "--device", session.device, "--json", part]
+    arguments: list[str | Path] = ["bench", suite, "--quick", "--device", session.device, "--json", part]
     code, _ = session.run(name, [PYTHON, "-m", "warp_gi.cli.main", *arguments])
     rows = [json.loads(line) for line in part.read_text(encoding="utf-8").splitlines()] if part.exists() else []
     if code != 0 and not any("failed" in row for row in rows):

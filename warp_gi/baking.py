@@ -34,13 +34,13 @@ _TYPES = ("bool", *_WHOLE, "float16", "float32", "float64")
 
 @dataclass(eq=False)
 class Bake:
-    """What an estimator computed before the first frame, and what it is valid for."""
+    """Results that an estimator computed before the first frame, and the scene and settings that they are valid for."""
 
     technique: str
     """Class name of the estimator."""
     scene_key: str
     """Hash of just what the bake depends on; for visibility ``Scene.geometry_hash``."""
-    settings: dict[str, Setting]
+    settings: dict[str, Any]
     """Settings of the estimator that the bake depends on: str, int, float or bool, by name."""
     arrays: dict[str, np.ndarray]
     """Arrays by name: bool, int8 to int64, uint8 to uint64 or float16 to float64, of any shape."""
@@ -78,7 +78,7 @@ class Bake:
             "warp_gi": __version__,
         }
         record["sha256"] = _seal(record, _digest(arrays))
-        with replacing(path) as part:
+        with replacing(path, own_folder=True) as part:  # save_file writes to a file of another name first
             try:
                 save_file(arrays, part, {FORMAT: json.dumps(record, sort_keys=True)})
             except SafetensorError as error:

@@ -143,7 +143,7 @@ def computed(
     reference = Reference((halves[0], halves[1]), {"reference": "path tracer", "spp": 2 * chunk * count})
     _check_finite(reference.picture, "the computed reference")
     reference.about.update(
-        {"max depth": pipeline.indirect.max_depth, "seconds": seconds, "noise RMSE": reference.noise, "says": _NOISE}
+        {"max depth": indirect.max_depth, "seconds": seconds, "noise RMSE": reference.noise, "says": _NOISE}
     )
     return reference
 

@@ -46,7 +46,7 @@ def _frames_row(run: Run) -> Row:
 
 
 def _equal_samples_row(run: Run, frames: int, found: Comparison) -> Row:
-    picture = run.first if frames == 1 else found.equal_samples[run.name]
+    picture = run.first if frames == 1 and run.first is not None else found.equal_samples[run.name]
     row: Row = {"table": "equal samples", "pipeline": run.name, "spp": run.pipeline.spp * frames, "frames": frames}
     return row | {"render s": run.points[frames - 1].seconds} | found.reference.errors(picture)
 
@@ -63,9 +63,9 @@ def _equal_time_row(run: Run, found: Comparison, limit: float) -> Row:
 
 
 def equal_error_rows(runs: Sequence[Run], setups: Mapping[str, Row]) -> list[Row]:
-    """Return when each pipeline gets to two errors, to stay there.
+    """Return the times after which each pipeline stays below two errors.
 
-    "all" is the lowest that every pipeline gets to, which is where the worst ends; "best" is where the best ends.
+    "all" is the lowest error that every pipeline reaches, where the worst ends; "best" is where the best ends.
     """
     last = {run.name: run.points[-1].rmse for run in runs}
     rows = []
@@ -79,7 +79,8 @@ def equal_error_rows(runs: Sequence[Run], setups: Mapping[str, Row]) -> list[Row
             row: Row = {"table": "equal error", "error that": _WORDS[name], "pipeline": run.name, "RMSE": target}
             row |= {"reached": seconds is not None, "render s": seconds}
             row["with build and bake s"] = _with_setup(seconds, setups.get(run.name, {}))
-            row[f"speed-up over {runs[0].name}"] = None if None in (seconds, base) else base / max(seconds, _TINY)
+            faster = None if seconds is None or base is None else base / max(seconds, _TINY)
+            row[f"speed-up over {runs[0].name}"] = faster
             rows.append(row)
     return rows
 

@@ -24,6 +24,7 @@ class Point:
     seconds: float
     """Wall time of these frames."""
     rmse: float
+    """Error of the mean of these frames."""
 
 
 @dataclass
@@ -55,7 +56,7 @@ class Run:
     @property
     def mean(self) -> np.ndarray:
         """The mean of all frames."""
-        return sum(self.sums) / self.count
+        return (self.sums[0] + self.sums[1]) / self.count
 
     def prepare(self, device: str) -> None:
         """Do what comes before the first frame."""
@@ -72,7 +73,7 @@ class Run:
         self.add(frame.numpy("beauty").astype(np.float64), *times, reference, limit)
 
     def add(self, picture: np.ndarray, wall: float, cpu: float, reference: Reference, limit: float) -> None:
-        """Take over a frame and its seconds; none that ends after ``limit`` and is not the first: it was the last."""
+        """Take over a frame and its seconds. One that ends after ``limit`` is dropped, unless it is the first."""
         if self.count and self.seconds + wall > limit:
             self.is_done = True
             return
@@ -84,12 +85,12 @@ class Run:
         self.points.append(Point(self.count, self.seconds, reference.errors(self.mean, flip=False)["RMSE"]))
 
     def floor(self, reference: Reference) -> tuple[float, float] | None:
-        """Return the RMSE and relMSE that more frames do not take away, if they show.
+        """Return the RMSE and relMSE that more frames do not take away, or None if they do not show.
 
-        None for denoisers over frames too, as those share their noise.
+        None too for denoisers over frames, whose frames share their noise.
         """
         denoise = self.pipeline.denoise
-        if self.count < 2 or (denoise is not None and denoise.depends_on_past()):
+        if self.count < 2 or (denoise is not None and denoise.depends_on_past(self.frames.scheduler.scene)):
             return None
         if reference.noise is not None and reference.noise > self.points[-1].rmse:
             return None  # relative errors are over a picture that is wrong itself, and would pass for a floor

@@ -10,12 +10,16 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench.compare.reference import StillFrames
 from warp_gi.bench.harness.measure import Row, in_process, peak_memory, timed
 from warp_gi.errors import GiError
+
+if TYPE_CHECKING:
+    from warp_gi.cli.compare_options import CompareBench
 
 
 def setup_of(pipeline: str, folder: Path, arguments: Sequence[str]) -> tuple[Row, list[gi.Bake]]:
@@ -37,7 +41,8 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _measured(name: str, folder: Path, options: object) -> Row:
+def _measured(name: str, folder: Path, options: CompareBench) -> Row:
+    """Return the seconds of each step of setting up a pipeline, and its peak memory."""
     from warp_gi.cli.compare_options import inputs_of, start
 
     start(options)

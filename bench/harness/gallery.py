@@ -6,6 +6,7 @@ import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -99,7 +100,7 @@ def run_parts(
     """Return the rows of a suite's parts, all of them if none is chosen; one that fails is a row that says why."""
     rows: list[Row] = []
     for name in chosen or parts:
-        rows += attempt({"part": name}, lambda name=name: call(parts[name], quick, device, gallery))
+        rows += attempt({"part": name}, partial(call, parts[name], quick, device, gallery))
     return rows
 
 

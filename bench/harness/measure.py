@@ -15,6 +15,7 @@ import time
 import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 from weakref import WeakSet
@@ -25,6 +26,8 @@ import warp as wp
 from warp_gi import launch
 
 Row = dict[str, Any]
+Series = Sequence[float] | np.ndarray
+"""Numbers, one for each turn, frame or case: float [number]."""
 Times = tuple[float, float]
 """Wall and CPU seconds."""
 T = TypeVar("T")
@@ -96,7 +99,7 @@ def take_turns(
     for index in range(1, repetitions + 1):
         for name, work in contenders.items():
             time.sleep(pause)
-            taken[name].add(lambda work=work, index=index: work(index), "cpu" if name in host else device, keep)
+            taken[name].add(partial(work, index), "cpu" if name in host else device, keep)
     return taken
 
 
@@ -115,7 +118,7 @@ def clocked(work: Callable[[], T], device: str = "cpu") -> tuple[T, Times, float
     wp.synchronize()
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     compiled, compiled_cpu = launch.compile_seconds - compiled, launch.compile_cpu_seconds - compiled_cpu
-    on_device = max(wp.get_event_elapsed_time(*events) / 1e3 - compiled, 0.0) if events else None
+    on_device = max(wp.get_event_elapsed_time(events[0], events[1]) / 1e3 - compiled, 0.0) if events else None
     return result, (wall - compiled, cpu - compiled_cpu), on_device
 
 
@@ -125,18 +128,18 @@ def timed(work: Callable[[], T]) -> tuple[T, Times]:
 
 
 def cost(times: Times, device: str) -> float:
-    """Return what counts of ``times``: CPU seconds on a CPU, of which others use some; wall seconds on a GPU."""
+    """Return the seconds that count: CPU seconds on a CPU, which other processes share; wall seconds on a GPU."""
     return times[1] if launch.get_device(device).is_cpu else times[0]
 
 
-def median_and_spread(name: str, values: Sequence[float]) -> Row:
-    """Return the median, and half of the range that the middle half of the values lie in."""
+def median_and_spread(name: str, values: Series) -> Row:
+    """Return the median of values, and as their spread half of the range of the middle half of them."""
     low, middle, high = np.percentile(values, (25, 50, 75))
     return {name: float(middle), f"{name} spread": float(high - low) / 2}
 
 
-def ratio_and_spread(name: str, above: Sequence[float], below: Sequence[float]) -> Row:
-    """Return the median and spread of the ratios, turn by turn: what slows the machine for a while slows both."""
+def ratio_and_spread(name: str, above: Series, below: Series) -> Row:
+    """Return median and spread of ratios turn by turn, as what slows the machine for a while slows both sides."""
     return median_and_spread(name, np.asarray(above, np.float64) / np.asarray(below, np.float64))
 
 
@@ -179,12 +182,13 @@ def attempt(said: Row, work: Callable[[], list[Row]]) -> list[Row]:
 
 
 class PeakMemory:
-    """The most memory this process has had resident since this was made.
+    """The largest resident memory of this process since the object was made.
 
-    Where the system cannot start anew (it is not Linux), since the process began.
+    Where the system cannot forget its peak (it is not Linux), it is the largest since the process began.
     """
 
     _live: ClassVar[WeakSet[PeakMemory]] = WeakSet()
+    _seen: float
 
     def __init__(self) -> None:
         before = peak_memory()
@@ -192,7 +196,7 @@ class PeakMemory:
             other._seen = max(other._seen, before)
         self._seen = 0.0
         self.is_anew = _forget_peak()
-        """Whether it is of what was done since this was made, and not of the whole process."""
+        """Whether the peak is that since the object was made, and not of the whole process."""
         PeakMemory._live.add(self)
 
     @property

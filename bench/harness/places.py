@@ -63,6 +63,8 @@ class Place:
         """Return the camera path; one key if it stands still."""
         if isinstance(self.view, gi.CameraPath):
             return self.view
+        if not isinstance(self.source, str):
+            raise TypeError("a scene that a function builds needs a camera path as `view`")
         if self.view:
             return gi.CameraPath.from_scene(gi.builtin_scene(self.source), self.view)
         return gi.builtin_camera_path(self.source)
@@ -79,7 +81,8 @@ def missing(files: Iterable[str]) -> str:
 
 
 def _still(eye: Point, target: Point, hfov: float, resolution: tuple[int, int] = (960, 540)) -> gi.CameraPath:
-    key = gi.CameraKey(0.0, tuple(map(float, eye)), tuple(map(float, target)), hfov=hfov)
+    (x, y, z), (u, v, w) = map(float, eye), map(float, target)
+    key = gi.CameraKey(0.0, (x, y, z), (u, v, w), hfov=hfov)
     return gi.CameraPath((key,), resolution=resolution)
 
 

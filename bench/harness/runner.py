@@ -13,7 +13,7 @@ import platform
 import subprocess
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -37,11 +37,12 @@ def run_suite(
     ``parts`` are names of the suite's ``PARTS``; none are all. Raises OptionError if there is no suite or part of that
     name, or no such device.
     """
-    if name not in (known := catalogue.suites()):
+    known = catalogue.suites()
+    suite = catalogue.module(name, "suite") if name in known else None
+    if suite is None:
         raise unknown_name("benchmark suite", name, known)
     launch.get_device(device)
-    commit()  # of what runs, whatever is committed meanwhile
-    suite = catalogue.module(name, "suite")
+    commit()  # the commit that runs, whatever is committed meanwhile
     for part in parts:
         if part not in (known_parts := getattr(suite, "PARTS", {})):
             raise unknown_name(f"part of suite {name}", part, known_parts)
@@ -72,7 +73,7 @@ def run_all(quick: bool, device: str, gallery: Gallery = CLOSED) -> Iterator[tup
     """
     launch.get_device(device)
     for name in catalogue.suites():
-        yield name, attempt({}, lambda name=name: run_suite(name, quick, device, gallery))
+        yield name, attempt({}, partial(run_suite, name, quick, device, gallery))
 
 
 def has_failed(rows: Iterable[dict[str, Any]]) -> bool:

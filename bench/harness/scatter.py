@@ -16,7 +16,8 @@ Pictures = Mapping[str, Sequence[np.ndarray]]
 
 def mean_of(pictures: Pictures) -> np.ndarray:
     """Return the mean of all pictures of all renderers, float64."""
-    return np.mean([picture for group in pictures.values() for picture in group], axis=0, dtype=np.float64)
+    every = np.stack([picture for group in pictures.values() for picture in group])
+    return np.asarray(every.mean(axis=0, dtype=np.float64))
 
 
 def errors(pictures: Pictures, name: str) -> Row:

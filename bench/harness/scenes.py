@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,7 @@ def peer_scene(
 
     def converted(material: gi.Material) -> gi.Material:
         if id(material) not in materials:
-            changes: dict[str, object] = {"normal_texture": None}
+            changes: dict[str, Any] = {"normal_texture": None}
             if diffuse:
                 changes |= {"specular": 0.0, "metallic": 0.0, "roughness": 1.0, "metallic_roughness_texture": None}
             if any(material.emission):
@@ -235,10 +236,11 @@ def _steps(poses: list[tuple[float, tuple[float, float, float], float]]) -> list
     keys: list[gi.Keyframe] = []
     for k, (begin, place, turn) in enumerate(poses):
         half = np.radians(turn) / 2
+        x, y, z = map(float, place)
         rotation = (0.0, float(np.sin(half)), 0.0, float(np.cos(half)))
         end = poses[k + 1][0] if k + 1 < len(poses) else begin + 1.0
         for time in (begin - 0.25 / FPS, end - 0.5 / FPS):
-            keys.append(gi.Keyframe(time, tuple(map(float, place)), rotation))
+            keys.append(gi.Keyframe(time, (x, y, z), rotation))
     return keys
 
 

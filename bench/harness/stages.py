@@ -114,7 +114,12 @@ def timed_bake(scene: gi.Scene, estimator: Any, device: str, camera: Any = None)
 def race(stages: Mapping[str, Stage | Callable[[], Any]], repetitions: int, device: str) -> dict[str, Taken[Any]]:
     """Return what each stage, or call, took; they take turns."""
     works = {name: stage.trace if isinstance(stage, Stage) else stage for name, stage in stages.items()}
-    return take_turns({name: lambda index, work=work: work() for name, work in works.items()}, repetitions, device)
+    return take_turns({name: _each_turn(work) for name, work in works.items()}, repetitions, device)
+
+
+def _each_turn(work: Callable[[], Any]) -> Callable[[int], Any]:
+    """Return a call that takes the number of the turn, and does the same in each."""
+    return lambda turn: work()
 
 
 def rmse(a: np.ndarray, b: np.ndarray | float = 0.0) -> float:

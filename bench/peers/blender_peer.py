@@ -79,8 +79,8 @@ def compare(job: Job, folder: Path) -> Row:
     ours = _ours(job, folder)
     theirs = _blender(job, path, folder)
     last = f"{job.frames - 1:04d}.exr"
-    a, b = (read_exr(folder / name / last)[0] for name in ("ours", "blender"))
-    a, b = a["beauty"].astype(np.float64), next(iter(b.values()))[..., :3].astype(np.float64)
+    mine, other = (read_exr(folder / name / last)[0] for name in ("ours", "blender"))
+    a, b = mine["beauty"].astype(np.float64), next(iter(other.values()))[..., :3].astype(np.float64)
     row: Row = {"table": "Blender", "scene": job.scene, "pixels": f"{job.size[0]}x{job.size[1]}", "spp": job.spp}
     row |= {"frames": job.frames, "ours frames a minute": 60 * job.frames / ours}
     row |= {"blender frames a minute": 60 * job.frames / theirs["wall s"], "faster": theirs["wall s"] / ours}
@@ -132,12 +132,13 @@ def _timed(command: list[str]) -> tuple[float, str]:
 
 
 def write_glb(scene: gi.Scene, path: Path) -> None:
-    """Write a scene at rest with Lambert materials, without normals, as GLB; cameras and sky stay behind."""
+    """Write a scene at time 0 as GLB, with Lambert materials, and without normals, cameras and sky."""
     import pygltflib
     import trimesh
     from PIL import Image
 
-    exported, materials = trimesh.Scene(), []
+    exported = trimesh.Scene()
+    materials: list[gi.Material] = []
     for index, node in enumerate(scene.nodes):
         for mesh in node.meshes:
             image = mesh.material.base_color_texture

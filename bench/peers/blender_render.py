@@ -9,6 +9,7 @@ import json
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 
 def main(path: str) -> None:
@@ -38,7 +39,7 @@ def main(path: str) -> None:
     print(json.dumps({"load s": loaded - started, "frames": frames, "version": bpy.app.version_string}))
 
 
-def _settings(scene: object, job: dict) -> None:
+def _settings(scene: Any, job: dict[str, Any]) -> None:
     """Set what makes the picture: samples, bounces, a box filter; no denoiser, no adaptive sampling, no clamping."""
     scene.render.engine = "CYCLES"
     cycles, render = scene.cycles, scene.render
@@ -52,7 +53,7 @@ def _settings(scene: object, job: dict) -> None:
     render.image_settings.file_format, render.image_settings.color_depth = "OPEN_EXR", "32"
 
 
-def _light(bpy: object, scene: object, sky: list[float]) -> None:
+def _light(bpy: Any, scene: Any, sky: list[float]) -> None:
     """Set a constant sky, and let surfaces emit on their front alone."""
     scene.world = bpy.data.worlds.new("sky")
     scene.world.use_nodes = True
@@ -60,9 +61,9 @@ def _light(bpy: object, scene: object, sky: list[float]) -> None:
     background.inputs["Color"].default_value, background.inputs["Strength"].default_value = (*sky, 1.0), 1.0
     for material in bpy.data.materials:
         shader = next((node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED"), None)
-        strength = shader.inputs["Emission Strength"] if shader else None
-        if strength is None or not any(shader.inputs["Emission Color"].default_value[:3]):
+        if shader is None or not any(shader.inputs["Emission Color"].default_value[:3]):
             continue
+        strength = shader.inputs["Emission Strength"]
         nodes, links = material.node_tree.nodes, material.node_tree.links
         facing, front = nodes.new("ShaderNodeNewGeometry"), nodes.new("ShaderNodeMath")
         front.operation = "MULTIPLY_ADD"  # strength times (1 - back facing)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from ctypes.util import find_library
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -73,11 +73,11 @@ def _started(variant: str) -> Any:
 
 
 def renderer(
-    scene: gi.Scene, camera: gi.Camera, integrator: dict[str, Any], spp: int, variant: str = LLVM
+    scene: gi.Scene, camera: gi.Camera, integrator: Mapping[str, Any], spp: int, variant: str = LLVM
 ) -> Callable[[int], np.ndarray]:
     """Return what renders float32 [height, width, 3] for a seed; raises as ``to_mitsuba``."""
     mi = load_mitsuba(variant)
-    peer, method = to_mitsuba(scene, camera, variant), mi.load_dict(integrator)
+    peer, method = to_mitsuba(scene, camera, variant), mi.load_dict(dict(integrator))
 
     def render(seed: int) -> np.ndarray:
         return np.array(load_mitsuba(variant).render(peer, integrator=method, spp=spp, seed=seed))
@@ -263,7 +263,7 @@ def _bsdf(mi: Any, material: gi.Material) -> dict[str, Any]:
         raise ValueError(f"material {material.name}: normal maps are not converted; take them off first")
     base = _color(mi, material.base_color, material.base_color_texture)
     if material.specular == 0.0 and material.metallic == 0.0:
-        bsdf = {"type": "twosided", "nested": {"type": "diffuse", "reflectance": base}}
+        bsdf: dict[str, Any] = {"type": "twosided", "nested": {"type": "diffuse", "reflectance": base}}
     else:
         image = material.metallic_roughness_texture
         channel = None if image is None else image.pixels.astype(np.float32) / 255.0
@@ -299,7 +299,7 @@ def _color(mi: Any, factor: Any, image: gi.Texture | None) -> dict[str, Any]:
 
 
 def _number(mi: Any, factor: float, image: gi.Texture | None, pixels: np.ndarray | None, channel: int) -> Any:
-    if image is None:
+    if image is None or pixels is None:
         return float(factor)
     return _bitmap(mi, pixels[..., channel : channel + 1] * factor, image)
 

@@ -84,8 +84,8 @@ def pages(root: Path) -> dict[Path, str]:
     texts = texts_of([row for row in rows if row.get("device", DEVICE) == DEVICE])
     others = [path.relative_to(root) for path in sorted(root.glob(PAGES)) if path != root / PAGE]
     short = {name: (regions()[name].introduction, text) for name, text in texts.items() if name != HEADLINES}
-    found = {path: filled(path, (root / path).read_text(encoding="utf-8"), texts) for path in (README, *others)}
-    return {PAGE: page(rows, short), **found}
+    documents = {path: filled(path, (root / path).read_text(encoding="utf-8"), texts) for path in (README, *others)}
+    return {PAGE: page(rows, short), **documents}
 
 
 def publish(root: Path, check: bool = False) -> list[Path]:

@@ -75,7 +75,8 @@ def _sections(rows: Sequence[records.Row], pictures: Sequence[PictureSet], plots
         {key: value.item() if isinstance(value, np.generic) else value for key, value in row.items()} for row in rows
     ]
     tables, environments = records.tables_of(plain), records.environments(rows)
-    suites = dict.fromkeys(one.suite for one in (*tables, *pictures, *plots))
+    named = [*(one.suite for one in tables), *(one.suite for one in pictures), *(one.suite for one in plots)]
+    suites = dict.fromkeys(named)
     return {
         suite: _section(
             suite,

@@ -65,7 +65,11 @@ def _plot(suite: str, choice: Choice, rows: list[Row]) -> Plot:
             column = _of_the_device(column, row)
             if column in row:
                 lines.setdefault(_line_name(choice, row, column), []).extend(_points(choice, row, column))
-    series = {name: tuple(zip(*sorted(points), strict=True)) for name, points in lines.items() if len(points) > 1}
+    series = {
+        name: (tuple(x for x, _ in sorted(points)), tuple(y for _, y in sorted(points)))
+        for name, points in lines.items()
+        if len(points) > 1
+    }
     y_label = ", ".join(choice.y) if choice.x != FRAME else "MSE / settled MSE"
     return Plot(choice.title, choice.x, y_label, series, choice.log_x, choice.log_y, choice.fit, suite)
 

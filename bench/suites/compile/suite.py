@@ -71,7 +71,7 @@ def _short(name: str) -> str:
 def main(arguments: Sequence[str]) -> None:
     """Load a module, or render a small frame, and print as JSON what was loaded and how long that took."""
     name, device = arguments
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_WARNING
     wp.init()
     loaded: list[str] = []
     launch.on_load = loaded.append

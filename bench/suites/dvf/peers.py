@@ -132,7 +132,7 @@ def equal_error_table(case: str, sky: str, taken: Mapping[str, Taken[np.ndarray]
 
 
 def _ours(scene: gi.Scene, camera: gi.Camera, estimator: Any, device: str) -> Callable[[int], np.ndarray]:
-    settings = {"emitters": None, "indirect": None, "spp": SPP}  # camera samples: the default
+    settings: dict[str, Any] = {"emitters": None, "indirect": None, "spp": SPP}  # camera samples: the default
     pipeline = gi.Pipeline(environment=estimator, **settings)
     scheduler = gi.FrameScheduler(scene, gi.CameraPath.still(camera), pipeline, device)
     return lambda index: scheduler.frame(index).numpy("beauty").copy()
@@ -197,7 +197,7 @@ def flight(size: tuple[int, int], frames: int) -> gi.CameraPath:
 def _child_main(width: str, height: str, frames: str, device: str, quick: str = "") -> None:
     import warp as wp
 
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_WARNING
     wp.init()
     scene = FLIGHT.scene()
     scene.data(device)
@@ -233,7 +233,7 @@ def relight(
         sky = smooth_sky()
         scene.environment = sky
         estimator = gi.VisibilityField(sky="harmonics", relight=kept, cell_size=cell_size)
-        settings = {"emitters": None, "indirect": None, "spp": SPP, "camera_samples": 1}
+        settings: dict[str, Any] = {"emitters": None, "indirect": None, "spp": SPP, "camera_samples": 1}
         pipeline = gi.Pipeline(environment=estimator, **settings)
         scheduler = gi.FrameScheduler(scene, gi.CameraPath.still(camera), pipeline, device)
         seconds = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from warp_gi.bench.publish.figures import Figure, Grid, GridColumn, Headline, Only, Region, Text
 from warp_gi.bench.suites.dvf.columns import COLUMNS
 
@@ -12,10 +14,10 @@ _VIEWS: dict[str, Only] = {
     "street from its ground": {"case": "street"},
 }
 _OVER_MITSUBA = 1.8
-"""The least that ``dvf_peers.TARGETS`` asks for."""
+"""Smallest factor over Mitsuba that ``peers.TARGETS`` asks for."""
 
 
-def _mode(header: str, key: str, mode: str = "three_state", **settings: object) -> GridColumn:
+def _mode(header: str, key: str, mode: str = "three_state", **settings: Any) -> GridColumn:
     return GridColumn(header, Figure(key, {"mode": mode}, **settings))
 
 

@@ -8,6 +8,7 @@ alone, primary rays apart, except where a row says otherwise. What the paper mea
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from warp_gi.bench.harness.gallery import CLOSED, Gallery, PictureSet, run_parts
@@ -45,7 +46,7 @@ def case_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
     rows: list[Row] = []
     for case in QUICK_CASES if quick else CASES:
         said = {"table": "modes", "case": case.name}
-        rows += attempt(said, lambda case=case: place_rows(case, quick, device, gallery))
+        rows += attempt(said, partial(place_rows, case, quick, device, gallery))
     return rows
 
 
@@ -134,8 +135,9 @@ def glossy_rows(name: str, view: FieldView, repetitions: int) -> list[Row]:
 
 def sweep_rows(view: FieldView, repetitions: int, quick: bool, spp: int = SPP) -> list[Row]:
     """Return a row for each value of the settings that the paper varies, and of the resolution of the masks."""
-    numbers = (80_000, 400_000, 2_000_000, 10_000_000, 0)
-    sizes, resolutions = (0.5, 1.0, 2.0, 4.0), (36, 48, 72, 84, 96)
+    numbers: tuple[int, ...] = (80_000, 400_000, 2_000_000, 10_000_000, 0)
+    sizes: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
+    resolutions: tuple[int, ...] = (36, 48, 72, 84, 96)
     if quick:
         numbers, sizes, resolutions = (80_000, 0), (2.0,), (48,)
     sweeps: list[tuple[str, str, dict[str, Any]]] = [

@@ -21,7 +21,7 @@ CASES = (
     Case("bistro_white", "Bistro", 2.0, {"cell_size": 1.0}, DARK),
     Case("street_white", "street", 2.0, {"cell_size": 1.0}, DARK),
 )
-QUICK_SETTINGS = {"cell_size": 4.0, "resolution": 36}
+QUICK_SETTINGS: dict[str, Any] = {"cell_size": 4.0, "resolution": 36}
 """Settings of fields that bake in seconds, and save less."""
 QUICK_CASES = tuple(replace(case, settings=QUICK_SETTINGS) for case in (CASES[0], CASES[3]))
 SIZE, QUICK_SIZE = (480, 270), (160, 90)
@@ -73,15 +73,15 @@ class FieldView(View):
     def stage(self, spp: int, **settings: Any) -> FieldStage:
         """Return the stage at ``spp`` samples a pixel."""
         estimator = self.estimator(**settings)
-        bake = None if estimator.mode == "traced" else self.bake(estimator)[0]
+        bake = self.bake(estimator)[0] if estimator.uses_cells else None
         return FieldStage(self.scene, self.camera, estimator, spp, self.device, bake)
 
     def scene_memory(self, stage: FieldStage) -> int:
         """Return the bytes of the field if every cell of the scene were baked."""
         size = stage.state.grid.cell_size
         if size not in self._cells:
-            state = FieldState(self.scene, launch.get_device(self.device), stage.estimator, 0)
-            self._cells[size] = len(state.baker("lasting").find().cells)
+            state = FieldState(self.scene, launch.get_device(self.device), stage.estimator.mask_settings, 0)
+            self._cells[size] = len(state.baker("static").find().cells)
         return self._cells[size] * 4 * stage.state.words + stage.state.slots.nbytes
 
 

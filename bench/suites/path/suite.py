@@ -12,8 +12,9 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -80,7 +81,7 @@ def case_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
     """Return the rows of all cases."""
     rows: list[Row] = []
     for case in QUICK_CASES if quick else CASES:
-        rows += attempt({"case": case.name}, lambda case=case: compare(case, quick, device, gallery))
+        rows += attempt({"case": case.name}, partial(compare, case, quick, device, gallery))
     return rows
 
 
@@ -97,7 +98,9 @@ def compare(case: Picture, quick: bool, device: str, gallery: Gallery = CLOSED) 
     size, spp, repetitions = (QUICK_SIZE, QUICK_SPP, QUICK_REPETITIONS) if quick else (SIZE, SPP, REPETITIONS)
     scene, camera = case.scene(), case.camera().at_resolution(*size)
     scheduler = gi.FrameScheduler(scene, gi.CameraPath.still(camera), pipeline(case.max_depth, spp), device)
-    renderers = {OURS: lambda index: scheduler.frame(index).numpy("beauty").copy()}
+    renderers: dict[str, Callable[[int], np.ndarray]] = {
+        OURS: lambda index: scheduler.frame(index).numpy("beauty").copy()
+    }
     rows: list[Row] = []
     for variant in VARIANTS:
         try:
@@ -107,7 +110,8 @@ def compare(case: Picture, quick: bool, device: str, gallery: Gallery = CLOSED) 
     peers = [name for name in renderers if name != OURS]
     taken = take_turns(renderers, repetitions, device, keep=repetitions, pause=PAUSE, host=peers)
     pictures = {name: one.results for name, one in taken.items()}
-    shown, others = ({name: group[part] for name, group in pictures.items()} for part in (0, slice(1, None)))
+    shown = {name: group[0] for name, group in pictures.items()}
+    others = {name: group[1:] for name, group in pictures.items()}
     gallery.add(PictureSet(f"{case.name}, {spp} samples a pixel", scatter.mean_of(others).astype(np.float32), shown))
     return rows + rows_of(case.name, size, spp, taken)
 
@@ -193,7 +197,7 @@ def _child(place: str, size: tuple[int, int], spp: int, device: str, **variables
 def _child_main(place: str, width: str, height: str, spp: str, device: str) -> None:
     import warp as wp
 
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_WARNING
     wp.init()
     started = time.time()
     loaded = PLACES[place].scene()

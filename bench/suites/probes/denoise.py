@@ -10,6 +10,7 @@ import warp_gi as gi
 from warp_gi.bench.harness.gallery import CLOSED, Gallery, PictureSet
 from warp_gi.bench.harness.measure import Row
 from warp_gi.bench.harness.stages import LAMBERT, Case
+from warp_gi.denoise import denoiser_named
 from warp_gi.errors import OptionError
 
 FRAME = 7
@@ -59,7 +60,7 @@ def pipeline_rows(
         row: Row = {"table": "denoise", "case": name, "pipeline": label, "rays a pixel": rays}
         pictures: dict[str, np.ndarray] = {}
         for denoiser, short in DENOISERS.items():
-            few = gi.Pipeline(**terms, spp=rays, camera_samples=1, denoise=denoiser)
+            few = gi.Pipeline(**terms, spp=rays, camera_samples=1, denoise=denoiser_named(denoiser))
             try:
                 scheduler = gi.FrameScheduler(scene, path, few, device, seed=1, bakes=bakes)
             except OptionError as missing:

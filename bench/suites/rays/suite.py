@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import warp as wp
@@ -21,6 +21,7 @@ from warp_gi import launch
 from warp_gi.bench.harness import scenes
 from warp_gi.bench.harness.measure import Row, attempt, median_and_spread, ratio_and_spread, take_turns
 from warp_gi.bench.harness.places import PLACES, Place
+from warp_gi.bench.suites.rays.kernels import warp_any, warp_closest
 from warp_gi.bvh import TriangleBvh
 from warp_gi.scene.camera import CameraKey
 
@@ -52,7 +53,7 @@ def run(quick: bool = False, device: str = "cpu", parts: Sequence[str] = ()) -> 
     """
     rows: list[Row] = []
     for name in parts or (QUICK_SCENES if quick else CASES):
-        rows += attempt({"scene": name}, lambda name=name: scene_rows(name, quick, device))
+        rows += attempt({"scene": name}, partial(scene_rows, name, quick, device))
     return rows
 
 
@@ -100,7 +101,7 @@ def build_all(name: str, points: np.ndarray, indices: np.ndarray, device: str, r
     """Return our tree, a wp.Mesh, Embree's scenes by name, and the row of build times (CPU seconds)."""
     TriangleBvh(points, indices[:100], device)  # compiles
     row: Row = {"table": "builds", "scene": name, "triangles": len(indices)}
-    builders: dict[str, Callable[[], object]] = {
+    builders: dict[str, Callable[[], Any]] = {
         "ours": lambda: TriangleBvh(points, indices, device),
         "warp": lambda: warp_mesh(points, indices, device),
     }
@@ -136,7 +137,7 @@ def _ignoring(work: Callable[[], T]) -> Callable[[int], T]:
 
 def warp_mesh(points: np.ndarray, indices: np.ndarray, device: str) -> wp.Mesh:
     """Return a wp.Mesh as fast as Warp makes it."""
-    options = {"bvh_constructor": "sah", "bvh_leaf_size": 4} if launch.get_device(device).is_cpu else {}
+    options: dict[str, Any] = {"bvh_constructor": "sah", "bvh_leaf_size": 4} if launch.get_device(device).is_cpu else {}
     return wp.Mesh(
         wp.array(points, dtype=wp.vec3, device=device),
         wp.array(indices.ravel(), dtype=wp.int32, device=device),
@@ -171,7 +172,7 @@ def race(
         runners[key] = partial(scene.run, origins, directions, query=name)
 
     def warp_query() -> np.ndarray:
-        rays = [wp.array(x, dtype=wp.vec3, device=device, copy=False) for x in (origins, directions)]
+        rays: list[wp.array] = [wp.array(x, dtype=wp.vec3, device=device, copy=False) for x in (origins, directions)]
         faces = wp.empty(len(origins), dtype=wp.int32, device=device)
         kernel = warp_any if query == "any" else warp_closest
         launch.launch(kernel, len(origins), [mesh.id, *rays, faces], device)
@@ -214,31 +215,6 @@ def scaling(tree: TriangleBvh, query: str, origins: np.ndarray, directions: np.n
     return row | ratio_and_spread("2 threads cpu", taken["2"].cpu, taken["1"].cpu)
 
 
-@wp.kernel(enable_backward=False)
-def warp_any(
-    first: wp.int32,
-    mesh: wp.uint64,
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    faces: wp.array(dtype=wp.int32),
-):
-    i = first + wp.tid()
-    faces[i] = wp.int32(wp.mesh_query_ray_anyhit(mesh, origins[i], directions[i], wp.inf))
-
-
-@wp.kernel(enable_backward=False)
-def warp_closest(
-    first: wp.int32,
-    mesh: wp.uint64,
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    faces: wp.array(dtype=wp.int32),
-):
-    i = first + wp.tid()
-    query = wp.mesh_query_ray(mesh, origins[i], directions[i], wp.inf)
-    faces[i] = wp.where(query.result, query.face, -1)
-
-
 def load_triangles(place: Place) -> tuple[np.ndarray, np.ndarray]:
     """Return float32 [vertex, 3] points and int32 [triangle, 3] indices of a place's scene file, or built-in scene."""
     import trimesh
@@ -246,7 +222,7 @@ def load_triangles(place: Place) -> tuple[np.ndarray, np.ndarray]:
     if not place.files:
         geometry = place.scene().data("cpu").geometry
         return geometry.points.numpy(), geometry.indices.numpy().reshape(-1, 3)
-    mesh = trimesh.load(scenes.SCENES / place.files[0], force="mesh", process=False)
+    mesh: Any = trimesh.load(scenes.SCENES / place.files[0], force="mesh", process=False)
     return np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.int32)
 
 
@@ -280,4 +256,4 @@ def primary_rays(case: CameraKey, count: int) -> tuple[np.ndarray, np.ndarray]:
     up = np.cross(side, forward)
     directions = forward + x[..., None] * right * side + y[..., None] * right * height / width * up
     directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).reshape(-1, 3).astype(np.float32)
-    return np.tile(np.float32(case.eye), (len(directions), 1)), directions
+    return np.tile(np.asarray(case.eye, np.float32), (len(directions), 1)), directions

@@ -159,7 +159,8 @@ def strobe_series(
     """Return the beauty's errors by frame of the period, mean over ``cycles`` of them after a first."""
     period = scenes.STROBE_PERIODS[kind]
     scene, camera = scenes.strobe(kind), STROBE.camera().at_resolution(*size)
-    make, truths = partial(Truth, scene, camera, device, spp), {}
+    make = partial(Truth, scene, camera, device, spp)
+    truths: dict[int, Truth] = {}
 
     def truth(index: int) -> Truth:
         return truths.setdefault(scenes.strobe_place(kind, index), make(index))

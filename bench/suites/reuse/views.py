@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 import warp_gi as gi
-from warp_gi.bench.harness.measure import Row, Times, cost, timed
+from warp_gi.bench.harness.measure import Row, Series, Times, cost, timed
 from warp_gi.bench.harness.scenes import REFERENCE_DEPTH
 from warp_gi.bench.harness.stages import Case
 from warp_gi.bench.suites.reuse.columns import TERMS
@@ -50,7 +51,7 @@ class Truth:
     device: str = "cpu"
     spp: int = 64
     frame: int = 0
-    settings: Mapping[str, int] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the paths."""
     _halves: list[dict[str, np.ndarray]] = field(default_factory=list)
 
@@ -96,7 +97,8 @@ class FrameRun:
     timings: list[dict[str, float]] = field(default_factory=list)
     times: list[Times] = field(default_factory=list)
     """Wall and CPU seconds of whole frames."""
-    frame: gi.Frame | None = None
+    frame: gi.Frame = field(init=False)
+    """The last frame; there is none before the first ``step``."""
 
     def step(self, index: int, truth: Truth) -> None:
         """Render a frame and measure it."""
@@ -145,27 +147,27 @@ def run_sequences(
     return runs
 
 
-def mean_series(series: Sequence[Sequence[float]]) -> np.ndarray:
+def mean_series(series: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
     """Return the mean of error series over seeds, [frame]."""
     return np.maximum(np.mean(np.asarray(series, np.float64), axis=0), 0.0)
 
 
-def settled_at(series: Sequence[float], settled: Sequence[float], window: int = 3) -> int:
+def settled_at(series: Series, settled: Series, window: int = 3) -> int:
     """Return the first frame from which on errors stay within `TOLERANCE` of the mean of ``settled``, errors too.
 
     A frame's error is noisy: it counts as the mean with the frames after it, ``window`` in all, less the standard
     deviation that such a mean of settled errors has. The length of the series says that it never settles.
     """
-    series, settled = np.asarray(series, np.float64), np.asarray(settled, np.float64)
-    bound = TOLERANCE * settled.mean() + settled.std() / window**0.5
-    means = np.lib.stride_tricks.sliding_window_view(series, window).mean(axis=1)
+    errors, at_last = np.asarray(series, np.float64), np.asarray(settled, np.float64)
+    bound = TOLERANCE * at_last.mean() + at_last.std() / window**0.5
+    means = np.lib.stride_tricks.sliding_window_view(errors, window).mean(axis=1)
     above = np.flatnonzero(means > bound)
     if not len(above):
         return 0
     return len(series) if above[-1] == len(means) - 1 else int(above[-1]) + 1
 
 
-def written(series: Sequence[float], unit: float = 1.0) -> str:
+def written(series: Series, unit: float = 1.0) -> str:
     """Return numbers as short text, in units of ``unit``."""
     return " ".join(f"{value / max(unit, 1e-30):.2f}" for value in series)
 

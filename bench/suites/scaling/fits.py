@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warp_gi.bench.harness.measure import Row, median_and_spread
+from warp_gi.bench.harness.measure import Row, Series, median_and_spread
 from warp_gi.bench.report.plots import exponent
 
 SAME_SIZE = 1.05
@@ -23,7 +23,7 @@ class Growth:
     """Ratios by the smaller size, for sizes of at most a tenth of the largest."""
 
     @staticmethod
-    def of(sizes: Sequence[float], turns: Sequence[Sequence[float]]) -> Growth:
+    def of(sizes: Sequence[float], turns: Sequence[Series]) -> Growth:
         """Return the growth of what was measured at each of two sizes or more, rising, in one turn or several.
 
         Where sizes have had different numbers of turns, that of their medians.

@@ -65,7 +65,7 @@ def light_rows_of(counts: Sequence[int], size: tuple[int, int], turns: int, devi
     schedulers: dict[tuple[str, int], gi.FrameScheduler] = {}
     starts: dict[tuple[str, int], Row] = {}
     for count in counts:
-        scene, made = timed(lambda count=count: _loaded(lamp_hall(count), device))
+        scene, made = timed(partial(_loaded_hall, count, device))
         for name, pipeline in pipelines.items():
             schedulers[name, count] = scheduler = gi.FrameScheduler(scene, camera, pipeline, device)
             _, baked = timed(scheduler.bake)
@@ -91,7 +91,9 @@ def light_row(scheduler: gi.FrameScheduler, taken: Taken[np.ndarray]) -> Row:
     return row | {"lights MB": device_bytes(frame.data.emitters, frame.paths.lights.data) / 1e6}
 
 
-def _loaded(scene: gi.Scene, device: str) -> gi.Scene:
+def _loaded_hall(count: int, device: str) -> gi.Scene:
+    """Return a hall with so many lights, its buffers on the device."""
+    scene = lamp_hall(count)
     scene.data(device)
     return scene
 

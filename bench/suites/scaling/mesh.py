@@ -42,7 +42,9 @@ def crowd(triangles: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         center = np.array([place // BLOBS + 0.5, 0.0, BLOBS - place % BLOBS - 0.5]) * spacing - (SIDE / 2, 0, SIDE / 2)
         center += (*rng.uniform(-0.3, 0.3, 2), 0.0)
         center[1] = rng.uniform(0.6, 3.2)
-        waves = sum(size * _wave(ball.points, frequency, rng) for frequency, size in OCTAVES)
+        waves = np.zeros(len(ball.points))
+        for frequency, height in OCTAVES:
+            waves += height * _wave(ball.points, frequency, rng)
         points = center + rng.uniform(0.7, 1.1) * (1.0 + waves)[:, None] * ball.points
         parts.append((points.astype(np.float32), ball.indices))
     starts = np.cumsum([0, *(len(points) for points, _ in parts[:-1])])

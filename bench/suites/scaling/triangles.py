@@ -108,7 +108,7 @@ def batches_of(points: np.ndarray, indices: np.ndarray, rays: int) -> dict[str, 
     """Return batches of about ``rays`` origins and directions; see ``KINDS``."""
     diffuse = diffuse_rays(points, indices, rays)
     again = np.random.default_rng(0).integers(FEW, size=-(-rays // TIMES)).repeat(TIMES)[:rays]
-    few = tuple(part[:FEW][again] for part in diffuse)
+    few = diffuse[0][:FEW][again], diffuse[1][:FEW][again]
     return dict(zip(KINDS, (primary_rays(CROWD_VIEW, rays), diffuse, in_cells(*diffuse), few), strict=True))
 
 

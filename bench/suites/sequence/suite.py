@@ -24,7 +24,7 @@ from warp_gi.bench.harness.places import PLACES
 from warp_gi.bench.peers import blender_peer
 from warp_gi.cli.report import Reporter, start_warp
 
-SCENE = PLACES["atrium"].source
+SCENE = str(PLACES["atrium"].source)
 CASES: dict[str, sequences.Sequence] = {
     name: case for _, module in catalogue.modules("sequence") for name, case in module.CASES.items()
 }
@@ -164,7 +164,7 @@ def main(arguments: Sequence[str]) -> int:
         add_stages(sums, result[1])
         return result
 
-    cli_render.render_shot = measured
+    cli_render.render_shot = measured  # type: ignore[assignment]
     report = Record()
     try:
         options = cli_render.parse(arguments)
@@ -176,7 +176,7 @@ def main(arguments: Sequence[str]) -> int:
         return 2
     once = {"load s": report.seconds["scene"], "bake s": report.seconds["bake"], "compile s": launch.compile_seconds}
     each = {f"{stage} s a frame": seconds / len(frames) for stage, seconds in sums.items()}
-    found = {"once": once, "a frame": each, "memory": list(memory), "frames": list(frames)}
+    found: dict[str, Any] = {"once": once, "a frame": each, "memory": list(memory), "frames": list(frames)}
     found |= {"inside s": time.perf_counter() - started, "cpu s": time.process_time(), "peak GB": peak_memory() / 1e9}
     print(json.dumps(found))
     return 0

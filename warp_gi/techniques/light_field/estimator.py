@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 
 from warp_gi import launch
-from warp_gi.baking import Bake
+from warp_gi.baking import Bake, Setting
 from warp_gi.errors import BakeError, OptionError, check_whole, unknown_name
 from warp_gi.estimator import Ahead, Estimator
 from warp_gi.kernels import gbuffer, light_field_cache
@@ -152,7 +152,7 @@ class LightFieldProbes(Estimator, RadianceCache):
         """
         return scene.contents_hash
 
-    def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Any]:
+    def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Setting]:
         """Return the settings that decide the maps."""
         return self.probe_settings.stored()
 
@@ -214,8 +214,9 @@ class LightFieldProbes(Estimator, RadianceCache):
         """
         if bake.technique != "LightFieldProbes":
             raise BakeError(f"expected a bake of LightFieldProbes, got one of {bake.technique}")
-        counts = tuple(int(count) for count in bake.settings["counts"].split("x"))
-        return replace(self, **{**bake.settings, "counts": counts})
+        baked: dict[str, Any] = {**bake.settings}
+        baked["counts"] = tuple(int(count) for count in baked["counts"].split("x"))
+        return replace(self, **baked)
 
     # ---- frames ----
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Literal
 
+from warp_gi.baking import Setting
+
 FEW_PROBES = 128
 """Probes up to which a map has ``FEW_RESOLUTION`` texels along a side unless told."""
 FEW_RESOLUTION, MANY_RESOLUTION = 128, 64
@@ -46,7 +48,7 @@ class ProbeSettings:
         """Texels along a side of the largest map of a probe, if there are many probes."""
         return max(map_resolution(self.resolution, MOST_PROBES), self.irradiance_resolution)
 
-    def stored(self) -> dict[str, str | float | int]:
+    def stored(self) -> dict[str, Setting]:
         """Return the settings that a bake stores and is checked by; how probes are refreshed is not among them."""
         values = asdict(self)
         del values["hysteresis"]

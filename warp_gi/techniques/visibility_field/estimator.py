@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 import warp as wp
 
 from warp_gi import launch
-from warp_gi.baking import Bake
+from warp_gi.baking import Bake, Setting
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.estimator import Ahead, Estimator
 from warp_gi.kernels import harmonics as harmonics_kernels
@@ -135,7 +135,7 @@ class VisibilityField(Estimator):
         """Return the hash of the geometry: nothing else decides visibility."""
         return whole_scene(scene).geometry_hash
 
-    def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Any]:
+    def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Setting]:
         """Return the settings that decide the masks, with the cell size in metres."""
         settings = self.mask_settings
         return stored_settings(settings, grid_of(scene.bounds, settings.cell_size))

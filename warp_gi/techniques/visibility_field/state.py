@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 
 from warp_gi import launch
-from warp_gi.baking import Bake
+from warp_gi.baking import Bake, Setting
 from warp_gi.errors import BakeError
 from warp_gi.kernels import gbuffer
 from warp_gi.kernels import visibility_field as field_kernels
@@ -356,7 +356,7 @@ class FieldState:
         return cells[order][cells[order] >= 0]
 
 
-def stored_settings(settings: MaskSettings, grid: Grid) -> dict[str, float | int]:
+def stored_settings(settings: MaskSettings, grid: Grid) -> dict[str, Setting]:
     """Return the settings that a bake stores and is checked by, with the cell size in metres."""
     return {**asdict(settings), "cell_size": grid.cell_size}
 
