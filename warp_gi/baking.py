@@ -149,8 +149,8 @@ def load_bake(path: str | Path) -> Bake:
     if seal != (digest if FORMAT not in metadata else _seal(record, digest)):
         raise _damaged(path)
     try:
-        technique, key, name = (str(record[text]) for text in _TEXTS)
-        return Bake(technique, key, dict(record["settings"]), arrays, dict(record["counts"]), name)
+        technique, scene_key, scene_name = (str(record[name]) for name in _TEXTS)
+        return Bake(technique, scene_key, dict(record["settings"]), arrays, dict(record["counts"]), scene_name)
     except (KeyError, TypeError, ValueError) as error:
         raise _damaged(path) from error
 
