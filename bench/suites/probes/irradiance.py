@@ -14,6 +14,7 @@ from warp_gi.bench.harness.stages import Stage
 from warp_gi.bench.suites.probes.kernels import gather_irradiance, read_irradiance
 from warp_gi.kernels.path_trace import TERM_INDIRECT
 from warp_gi.techniques.light_field.estimator import VISIBILITIES
+from warp_gi.techniques.light_field.places import lit_data
 from warp_gi.techniques.light_field.state import path_settings
 
 
@@ -28,7 +29,7 @@ def path_traced(stage: Stage, spp: int, seed: int) -> np.ndarray:
     paths.terms, paths.max_depth, paths.spp = int(TERM_INDIRECT), REFERENCE_DEPTH, spp
     found = wp.zeros(width * height, dtype=wp.vec3, device=frame.device)
     bits = (spp - 1).bit_length()
-    data = stage.state.lit_data(frame.scene)
+    data = lit_data(frame.scene, frame.device)
     frame.launch(gather_irradiance, [data, width, paths, bits, wp.uint32(seed), frame.hits, found])
     return found.numpy().reshape(height, width, 3)
 
