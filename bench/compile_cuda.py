@@ -65,7 +65,7 @@ def compile_module(name: str, architectures: Sequence[int], folder: Path) -> lis
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Compile all, on every core, and print what it took."""
+    """Compile all modules, on every core, and print size and seconds of each."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("arch", nargs="*", type=int, default=ARCHITECTURES, help="compute capability, as 90")
     options = parser.parse_args(arguments)

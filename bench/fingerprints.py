@@ -27,7 +27,7 @@ SAMPLES = 4
 
 
 def pipelines() -> dict[str, gi.Pipeline]:
-    """Return what is rendered, by name."""
+    """Return the pipelines that are rendered, by name."""
     small: dict[str, Any] = {"spp": SAMPLES}
     found = {name: gi.Pipeline.preset(name, **small) for name in PRESETS}
     hierarchy, uniform = gi.LightHierarchy(), gi.UniformLights()
@@ -71,7 +71,7 @@ def hashed(frame: gi.Frame) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Compare with a file of hashes, or write it."""
+    """Compare hashes with those in a file, or write the file; return 1 if any differ."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("file", type=Path, help="hashes, JSON; written if it is not there")
     parser.add_argument("--device", default="cpu", help="cpu, cuda or cuda:1")

@@ -30,7 +30,7 @@ class Picture(Case):
     """A place as both renderers get it: the materials Mitsuba has an equal for, flat normals, one-sided emission."""
 
     max_depth: int = 4
-    """Edges of the longest path, camera to light: 2 is direct light."""
+    """Number of edges of the longest path from camera to light: 2 is direct light."""
     peer_error: float = 0.0
     """Relative standard error of Mitsuba's picture that comes from its ray offset: rays start 9e-5 (1 + |x|) m
     off a surface at x and look past what is thinner, such as paint. With that offset here the difference is gone."""

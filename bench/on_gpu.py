@@ -25,11 +25,11 @@ from xml.etree import ElementTree
 ROOT = Path(__file__).resolve().parents[1]
 PYTHON = ROOT / ".venv" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 MARK = "every_device"
-"""Fixture of the tests that run on every device; its parameter is in their ids."""
+"""Fixture of tests that run on every device; the device is a part of their ids."""
 FIRST_TESTS, LAST_TESTS = "tests/kernels", "tests/truth"
 FIRST_SUITES = ("rays", "path")
 STARTING_SHARE = 0.8
-"""Share of the time in which something new is started."""
+"""Share of the time after which nothing new is started."""
 ASK = """
 import json, sys
 from warp_gi.bench.harness import catalogue, runner
@@ -40,12 +40,12 @@ Row = dict[str, Any]
 
 @dataclass
 class Session:
-    """What is run, until when, and what came of it."""
+    """Programs that are run within a limit of time, and their results."""
 
     device: str
     output: Path
     end: float
-    """Seconds of time.monotonic at which what runs is stopped."""
+    """Value of time.monotonic at which the running program is stopped, seconds."""
     last_start: float
     environment: Row = field(default_factory=dict)
     rows: list[Row] = field(default_factory=list)
@@ -54,7 +54,7 @@ class Session:
 
     @property
     def is_over(self) -> bool:
-        """Whether nothing new is started any more."""
+        """Whether it is too late to start another program."""
         return time.monotonic() >= self.last_start
 
     def run(self, name: str, command: list[str | Path]) -> tuple[int | None, float]:
@@ -85,7 +85,7 @@ class Session:
 
 
 def main() -> int:
-    """Run the command; return 1 if something failed or was stopped."""
+    """Run all tests and suites; return 1 if one failed or was stopped."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cuda", help="cuda, cuda:1, or cpu to try this out")
     parser.add_argument("--minutes", type=float, default=10.0, help="most that all of it takes")
@@ -185,7 +185,7 @@ def run_suite(session: Session, suite: str) -> None:
 
 
 def last_error(session: Session) -> str:
-    """Return the last line of the log that says something."""
+    """Return the last line of the log that is not empty."""
     lines = session.output.with_suffix(".log").read_text(encoding="utf-8", errors="replace").splitlines()
     return re.sub(r"\s+", " ", next((line for line in reversed(lines) if line.strip()), ""))[:200]
 

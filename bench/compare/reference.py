@@ -43,7 +43,7 @@ class StillFrames:
         self.seed, self.count = seed, 0
 
     def next(self) -> gi.Frame:
-        """Render one more."""
+        """Render one more frame, and return it."""
         index = self.count
         self.count += 1
         if self.moment is None:
@@ -62,7 +62,7 @@ class Reference:
 
     halves: tuple[np.ndarray, np.ndarray]
     about: Row = field(default_factory=dict)
-    """How it was made."""
+    """How the reference was made, by name: renderer, samples, seconds, noise."""
 
     @cached_property
     def picture(self) -> np.ndarray:

@@ -86,7 +86,7 @@ def equal_error_rows(runs: Sequence[Run], setups: Mapping[str, Row]) -> list[Row
 
 
 def _with_setup(seconds: float | None, setup: Row) -> float | None:
-    """Return seconds with those of building the tree and baking; None if either is not known."""
+    """Return seconds plus those of building the tree and of baking; None if either is not known."""
     if seconds is None or not {"build s", "bake s"} <= setup.keys():
         return None
     return seconds + setup["build s"] + setup["bake s"]

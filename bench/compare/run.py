@@ -22,7 +22,7 @@ class Point:
 
     frames: int
     seconds: float
-    """Wall time of these frames."""
+    """Wall time of these frames, seconds."""
     rmse: float
     """Error of the mean of these frames."""
 
@@ -40,17 +40,17 @@ class Run:
     sums: list[np.ndarray] = field(default_factory=list)
     """Sums of frames 0, 2, 4, ... and of frames 1, 3, 5, ..., float64 [height, width, 3]."""
     first: np.ndarray | None = None
-    """The first frame."""
+    """The first frame, float64 [height, width, 3]; None before it."""
     is_done: bool = False
 
     @property
     def count(self) -> int:
-        """Frames rendered."""
+        """Number of frames rendered."""
         return len(self.wall)
 
     @property
     def seconds(self) -> float:
-        """Wall time of the frames."""
+        """Wall time of all frames, seconds."""
         return sum(self.wall)
 
     @property
@@ -111,7 +111,7 @@ class Comparison:
 def take_turns(
     runs: Mapping[str, Run], reference: Reference, limit: float, told: Callable[[float], None] = lambda share: None
 ) -> Comparison:
-    """Let the pipelines render a frame each in turn, until none can finish another within ``limit`` seconds."""
+    """Let the pipelines render one frame each in turn, until none can finish another one within ``limit`` seconds."""
     active, equal, rounds = list(runs.values()), {}, 0
     while active := [run for run in active if run.fits(limit)]:
         for run in active:
@@ -144,7 +144,7 @@ def runs_of(
 
 
 def seconds_to(points: list[Point], target: float) -> float | None:
-    """Return after how many seconds the error gets to ``target`` to stay there; None if it ends above.
+    """Return the seconds after which the error stays below ``target``; None if it ends above.
 
     Between the last point above and the next, errors are a power of time.
     """

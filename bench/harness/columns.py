@@ -16,7 +16,7 @@ from warp_gi.bench.harness.records import SERIES
 from warp_gi.errors import OptionError
 
 Better = Literal["lower", "higher"] | None
-"""None: neither, or not for us to improve, as the time of another renderer."""
+"""Whether lower or higher values are better; None: neither is, or they are not ours, as another renderer's time."""
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,12 @@ class Kind:
     is_timed: bool = False
     """Whether values depend on the machine's speed."""
     is_key: bool = False
-    """Whether values say what a row is of, and so tell rows apart."""
+    """Whether values name what a row is about, and so tell rows apart."""
 
 
 KEY = Kind("key", None, is_key=True)
 NOTE = Kind("note", None)
-"""Aims, remarks, series: what is said of a row, and not compared."""
+"""Targets, remarks and series, which are not compared."""
 TIME = Kind("time", 0.15, is_timed=True)
 RATE = Kind("rate", 0.15, is_timed=True)
 RATIO = Kind("ratio", 0.15, is_timed=True)
@@ -42,7 +42,7 @@ RATIO = Kind("ratio", 0.15, is_timed=True)
 ERROR = Kind("error", 0.05)
 """Errors, ratios of errors, and shares that are right or wrong."""
 COUNT = Kind("count", 0.05)
-"""Numbers and shares of things."""
+"""Counts and shares of things."""
 MEMORY = Kind("memory", 0.05)
 SPREADS = ("spread", "+-", "±")
 """A column's name and one of these names the spread of its values, "wall s spread". New rows have the first."""
@@ -61,17 +61,17 @@ class Column:
 
     @property
     def said(self) -> str:
-        """Unit and what is better, in words, for readers of a table."""
+        """Unit and direction of improvement in words, for readers of a table."""
         return "; ".join(text for text in (self.unit, f"{self.better} is better" if self.better else "") if text)
 
 
 def keys(*names: str) -> list[Column]:
-    """Return columns that say what a row is of."""
+    """Return columns whose values name what a row is about."""
     return [Column(name, "", None, KEY) for name in names]
 
 
 def notes(*names: str) -> list[Column]:
-    """Return columns that are said of a row and not compared: aims, remarks, series."""
+    """Return columns of targets, remarks and series, which are not compared."""
     return [Column(name, "", None, NOTE) for name in names]
 
 

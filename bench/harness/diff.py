@@ -15,9 +15,9 @@ from warp_gi.cli.report import print_table
 from warp_gi.errors import OptionError
 
 MACHINE = ("cpu", "cores", "threads", "device")
-"""Where these differ, times cannot be compared."""
+"""Columns that must be equal in two rows for their times to be compared."""
 PEERS = ("mitsuba", "embree", "blender")
-"""How the values of the column "renderer" begin that are not ours to be slower."""
+"""Beginnings of the names in the column "renderer" that are other renderers, whose times are not ours to improve."""
 SPREADS_APART, LEAST_SHARE = 2.0, 0.03
 """How many of both spreads, half of the middle half each, medians of a few turns may differ by: one of twenty medians
 of five turns of the same does by more. The share is what runs of one machine differ by in any case; quick ones have too
@@ -34,12 +34,12 @@ class Change:
     old: float
     new: float
     limit: float
-    """The change that would have been within the spread."""
+    """Largest change that would have been within the spread."""
 
 
 @dataclass
 class Difference:
-    """What ``compare`` finds."""
+    """Result of ``compare``: changes, and rows that only one side has."""
 
     worse: list[Change] = field(default_factory=list)
     better: list[Change] = field(default_factory=list)
@@ -54,7 +54,7 @@ class Difference:
 
 
 def identity_of(row: records.Row) -> Identity:
-    """Return what a row is of: its suite, whether it is a quick run, and the values of its suite's keys."""
+    """Return what a row is about: its suite, whether it is a quick run, and the values of its suite's keys."""
     columns = catalogue.columns_of(str(row.get("suite", "")))
     kept = [(name, value) for name, value in records.measured(row).items() if columns.is_key(name, value)]
     return tuple(sorted([*kept, *((name, row[name]) for name in ("suite", "table", "quick") if name in row)]))

@@ -16,9 +16,9 @@ from warp_gi.errors import OptionError
 
 REFERENCE = "reference"
 WIDEST = 240
-"""Pixels that a suite's pictures are wide at most, so that a report of all suites stays near 10 MB."""
+"""Largest width in pixels of a suite's pictures, which keeps a report of all suites near 10 MB."""
 ROUNDING = 2.0**-6
-"""Most that rounding changes a suite's pictures by, so that they zip well; its squares are below error maps' scale."""
+"""Largest relative change of a suite's pictures by rounding, which makes them zip well; error maps do not show it."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class PictureSet:
     images: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Linear radiance by estimator, each of the reference's shape. May hold NaN and infinities, which are shown."""
     suite: str = ""
-    """The suite in whose section of the report they stand."""
+    """Name of the suite in whose section of the report the pictures stand."""
     note: str = ""
-    """What was done to them after rendering."""
+    """Note on what was done to the pictures after rendering."""
 
     def all(self) -> dict[str, np.ndarray]:
         """Return the reference, if there is one, and the images."""
@@ -66,12 +66,12 @@ class PictureSet:
 
 @dataclass(frozen=True)
 class Gallery:
-    """Where suites put pictures for a report."""
+    """Pictures that suites add for a report."""
 
     suite: str = ""
     sets: list[PictureSet] = field(default_factory=list)
     is_open: bool = True
-    """Whether anything is kept."""
+    """Whether pictures are kept."""
 
     def of(self, suite: str) -> Gallery:
         """Return this gallery for another suite; the sets are shared."""
@@ -85,7 +85,7 @@ class Gallery:
 
 
 CLOSED = Gallery(is_open=False)
-"""Where no report is written."""
+"""Gallery that keeps nothing, for runs without a report."""
 
 
 def call(measure: Callable[..., Any], quick: bool, device: str, gallery: Gallery, **others: Any) -> Any:

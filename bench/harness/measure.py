@@ -38,12 +38,12 @@ T = TypeVar("T")
 
 @dataclass
 class Taken(Generic[T]):
-    """What the turns of one contender took, in seconds, and what the first of them returned."""
+    """Seconds of the turns of one contender, and results of the first of them."""
 
     wall: list[float] = field(default_factory=list)
     cpu: list[float] = field(default_factory=list)
     device: list[float] = field(default_factory=list)
-    """Seconds by events on a CUDA device; empty on the CPU."""
+    """Seconds of each turn by events on a CUDA device; empty on the CPU."""
     results: list[T] = field(default_factory=list)
 
     @property
@@ -104,7 +104,7 @@ def take_turns(
 
 
 def clocked(work: Callable[[], T], device: str = "cpu") -> tuple[T, Times, float | None]:
-    """Return what ``work`` does, its wall and CPU seconds, and seconds between events around it on a CUDA device."""
+    """Return the result of ``work``, its wall and CPU seconds, and on CUDA the seconds between events around it."""
     found = launch.get_device(device)
     events = [wp.Event(found, enable_timing=True) for _ in range(2)] if found.is_cuda else []
     wp.synchronize()
@@ -123,7 +123,7 @@ def clocked(work: Callable[[], T], device: str = "cpu") -> tuple[T, Times, float
 
 
 def timed(work: Callable[[], T]) -> tuple[T, Times]:
-    """Return what ``work`` does, and its wall and CPU seconds."""
+    """Return the result of ``work``, and its wall and CPU seconds."""
     return clocked(work)[:2]
 
 

@@ -18,21 +18,21 @@ _SPONZA, _BISTRO = "crytek_sponza.glb", "bistro_exterior.glb"
 
 @dataclass(frozen=True)
 class Place:
-    """A scene, what lights it, and where it is seen from."""
+    """A scene with its light and its camera."""
 
     title: str
     source: str | Callable[[], gi.Scene]
-    """A file of `scenes.SCENES`, the name of a built-in scene, or what builds one."""
+    """A file in `scenes.SCENES`, the name of a built-in scene, or a function that builds one."""
     view: gi.CameraPath | str = ""
     """Where it is seen from, and at which size: a path, or the name of a camera of the built-in scene; its own path."""
     environment: Color | str | None = None
-    """Radiance of a constant sky, or a file of `scenes.SCENES`; None leaves the scene what it has itself."""
+    """Radiance of a constant sky, or a file in `scenes.SCENES`; None leaves the scene its own sky."""
     reads: tuple[str, ...] = ()
-    """Files of `scenes.SCENES` that ``source`` builds of."""
+    """Files in `scenes.SCENES` that the function ``source`` reads."""
 
     @property
     def files(self) -> tuple[str, ...]:
-        """What has to be in `scenes.SCENES`, geometry first."""
+        """Files that must be in `scenes.SCENES`, the geometry first."""
         files = [*self.reads]
         if isinstance(self.source, str) and "." in self.source:
             files.append(self.source)
@@ -42,7 +42,7 @@ class Place:
 
     @property
     def missing(self) -> str:
-        """What to say if a file is not there, or nothing."""
+        """Message about files that are missing; empty if none are."""
         return missing(self.files)
 
     def scene(self) -> gi.Scene:
@@ -60,7 +60,7 @@ class Place:
         return scene
 
     def path(self) -> gi.CameraPath:
-        """Return the camera path; one key if it stands still."""
+        """Return the camera path; it has one key if the camera stands still."""
         if isinstance(self.view, gi.CameraPath):
             return self.view
         if not isinstance(self.source, str):
@@ -75,7 +75,7 @@ class Place:
 
 
 def missing(files: Iterable[str]) -> str:
-    """Return what to say if some of these are not in `scenes.SCENES`, or nothing."""
+    """Return a message about those files that are not in `scenes.SCENES`; empty if all are."""
     absent = ", ".join(str(scenes.SCENES / name) for name in files if not (scenes.SCENES / name).exists())
     return f"no {absent}; set WARP_GI_SCENES to the folder of the scene files" if absent else ""
 

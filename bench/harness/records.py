@@ -16,9 +16,9 @@ PACKAGES = ("warp-lang", "numpy", "mitsuba", "embreex", "pyoidn", "OpenImageIO",
 ENVIRONMENT = ("quick", "commit", "warp_gi", "python", *PACKAGES, "cpu", "cores", "threads", "device")
 """Keys of a line of results that say how it was measured."""
 SERIES = re.compile(r"[-+.\deE]+(\s+[-+.\deE]+)+")
-"""Numbers in words: a series over frames."""
+"""Pattern of a text that holds a series of numbers over frames."""
 MACHINE = ("cpu", "cores", "threads", "device", "quick")
-"""What must be the same of figures that stand in one table; commits and versions may differ from part to part."""
+"""Keys that must be equal in figures of one table; commits and versions may differ from part to part."""
 
 
 def read(paths: Iterable[Path]) -> list[Row]:
@@ -59,14 +59,14 @@ class Table:
 
     suite: str
     name: str
-    """What the rows' key "table" says, or nothing."""
+    """Value of the rows' key "table"; empty without one."""
     columns: tuple[str, ...]
     rows: list[list[Any]]
     """Values in the order of the columns."""
 
     @property
     def is_quoted(self) -> bool:
-        """Whether these are a paper's own figures, not ours."""
+        """Whether the rows are a paper's own figures, not ours."""
         return "paper" in self.name.lower()
 
 
@@ -81,7 +81,7 @@ def tables_of(rows: Iterable[Row]) -> list[Table]:
 
 
 def is_number(value: Any) -> bool:
-    """Return whether a value is a number; yes and no are none."""
+    """Return whether a value is a number; True and False are not."""
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 

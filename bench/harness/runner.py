@@ -26,7 +26,7 @@ from warp_gi.errors import unknown_name
 from warp_gi.files import replacing
 
 WHOLE = "run"
-"""Table of what a whole suite took; CPU seconds, compilation and memory are of this process alone."""
+"""Name of the table with the time and memory of a whole suite; all but wall seconds are of this process alone."""
 
 
 def run_suite(

@@ -146,9 +146,9 @@ def cylinder_box() -> gi.Scene:
 FPS = 24.0
 _COVER = 2.35  # m, height of the dragon's cover
 RING_RADIUS, RING_WALL = 2.0, 3.0
-"""Metres, of the floor and of the wall around it."""
+"""Radii of the ring's floor and of the wall around it, metres."""
 STROBE_PERIODS = {"jump": 32, "slit": 16}
-"""Frames after which the lamp of `strobe` is where it was."""
+"""Number of frames after which the lamp of `strobe` is back in its place, by kind."""
 _CYCLES = 8
 
 

@@ -30,7 +30,7 @@ class Case:
     name: str = ""
     """Name in rows; the place's title if not given."""
     target: float = 0.0
-    """How many times faster than the baseline the estimator shall be."""
+    """Target: how many times faster than the baseline the estimator is to be."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the estimator that are not its defaults."""
     materials: Mapping[str, bool] | None = None
@@ -41,7 +41,7 @@ class Case:
 
     @property
     def missing(self) -> str:
-        """What to say if one of the place's files is not there, or nothing."""
+        """Message about the place's files that are missing; empty if none are."""
         return PLACES[self.place].missing
 
     def scene(self) -> gi.Scene:
@@ -79,7 +79,7 @@ class Stage:
         self.albedo = self.frame.numpy("albedo").copy()
 
     def trace(self) -> None:
-        """Do the stage once more; its sums are no picture any more."""
+        """Do the stage once more. The buffers then hold sums of several runs, and no picture."""
         self.estimator.trace(self.frame, self.state)
         if self.frame.paths.is_wanted:
             self.frame.trace_paths()
@@ -99,7 +99,7 @@ class View:
     """Bakes and their seconds, by the settings that they depend on."""
 
     def bake(self, estimator: Any) -> tuple[gi.Bake, Times]:
-        """Return the bake and what it took, compilation apart."""
+        """Return the bake and its seconds without compilation."""
         key = repr(estimator.bake_settings(self.scene))
         if key not in self.bakes:
             self.bakes[key] = timed_bake(self.scene, estimator, self.device, self.path or self.camera)
@@ -107,12 +107,12 @@ class View:
 
 
 def timed_bake(scene: gi.Scene, estimator: Any, device: str, camera: Any = None) -> tuple[gi.Bake, Times]:
-    """Return what the camera, or path, makes the estimator bake, and seconds without compilation."""
+    """Return the estimator's bake for a camera or path, and its seconds without compilation."""
     return timed(lambda: gi.bake(scene, estimator, device, camera_path=camera))
 
 
 def race(stages: Mapping[str, Stage | Callable[[], Any]], repetitions: int, device: str) -> dict[str, Taken[Any]]:
-    """Return what each stage, or call, took; they take turns."""
+    """Return times and results of stages, or calls, that take turns."""
     works = {name: stage.trace if isinstance(stage, Stage) else stage for name, stage in stages.items()}
     return take_turns({name: _each_turn(work) for name, work in works.items()}, repetitions, device)
 

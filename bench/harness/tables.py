@@ -17,13 +17,13 @@ class Shown:
     """A table of results as it is shown."""
 
     said: str
-    """What all rows say, or nothing."""
+    """Columns whose value is the same in all rows, in words; empty without any."""
     columns: Columns
     """Values by column: numbers, or words."""
     names: list[str]
-    """The columns that tell what a row is of."""
+    """Columns whose values name what a row is about."""
     numeric: frozenset[str]
-    """The columns that hold numbers, be they beside a spread or in words."""
+    """Columns that hold numbers, also those with a spread beside them or in words."""
 
 
 def shown(table: records.Table) -> Shown:
@@ -48,7 +48,7 @@ def print_rows(suite: str, rows: Sequence[records.Row], is_titled: bool = True) 
 
 
 def _identity(table: records.Table) -> list[str]:
-    """Return the columns that tell what a row is of."""
+    """Return the columns whose values name what a row is about."""
     columns = catalogue.columns_of(table.suite)
     values = zip(table.columns, zip(*table.rows, strict=True), strict=True)
     found = [name for name, given in values if any(columns.is_key(name, value) for value in given)]

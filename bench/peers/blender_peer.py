@@ -32,16 +32,16 @@ HOW_TO_INSTALL = (
     "(bpy 4.2 to 5.0) and 3.13 (bpy 5.1 and later); WARP_GI_BLENDER_PYTHON names another Python that has it"
 )
 SKY = WHITE
-"""W/(m^2 sr)."""
+"""Radiance of the constant sky, W/(m^2 sr)."""
 MAX_DEPTH = 6
 
 
 @dataclass(frozen=True)
 class Job:
-    """A sequence that both render."""
+    """A sequence that Blender and we render."""
 
     scene: str
-    """Key of a built-in one in `PLACES`, along its camera path."""
+    """Key in `PLACES` of a built-in scene, which is rendered along its camera path."""
     frames: int
     size: tuple[int, int]
     spp: int
@@ -51,7 +51,7 @@ FULL, QUICK = Job("atrium", 48, (480, 270), 16), Job("cornell_box", 2, (64, 48),
 
 
 def rows(job: Job) -> list[Row]:
-    """Return a row of speed and likeness, or one that says what is missing or failed."""
+    """Return a row of speed and of differences of the pictures, or one that says what is missing or failed."""
     if not is_installed():
         return [{"table": "Blender", "scene": job.scene, "skipped": HOW_TO_INSTALL}]
     with tempfile.TemporaryDirectory() as folder:
@@ -159,7 +159,7 @@ def write_glb(scene: gi.Scene, path: Path) -> None:
 
 
 def _describe(material: Any, source: gi.Material) -> None:
-    """Set what trimesh rounds to bytes or leaves out."""
+    """Write into the file the material numbers that trimesh rounds to bytes or leaves out."""
     from pygltflib import PbrMetallicRoughness
 
     strength = max(*source.emission, 0.0)

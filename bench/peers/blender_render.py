@@ -13,7 +13,7 @@ from typing import Any
 
 
 def main(path: str) -> None:
-    """Render every frame, and print what it took as JSON on the last line."""
+    """Render every frame, and print seconds as JSON on the last line."""
     import bpy
 
     job = json.loads(Path(path).read_text(encoding="utf-8"))

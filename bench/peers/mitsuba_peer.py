@@ -35,7 +35,7 @@ class PeerMissing(RuntimeError):
 
 
 LLVM, SCALAR = "llvm_ad_rgb", "scalar_rgb"
-"""Variants: kernels compiled for vectors, and a ray at a time."""
+"""Variants of Mitsuba: kernels compiled for vectors by LLVM, and scalar code that traces a ray at a time."""
 
 
 def load_mitsuba(variant: str = LLVM) -> Any:
@@ -75,7 +75,7 @@ def _started(variant: str) -> Any:
 def renderer(
     scene: gi.Scene, camera: gi.Camera, integrator: Mapping[str, Any], spp: int, variant: str = LLVM
 ) -> Callable[[int], np.ndarray]:
-    """Return what renders float32 [height, width, 3] for a seed; raises as ``to_mitsuba``."""
+    """Return a function of a seed that renders float32 [height, width, 3]; raises as ``to_mitsuba``."""
     mi = load_mitsuba(variant)
     peer, method = to_mitsuba(scene, camera, variant), mi.load_dict(dict(integrator))
 

@@ -46,9 +46,8 @@ class Watch:
 
     def __init__(self, owners: Sequence[Owner], bare: bool = False) -> None:
         pairs = [owner if isinstance(owner, tuple) else (owner, _field_names(owner)) for owner in owners]
-        self._owners = [
-            (owner, names, attrgetter(*names)) for owner, names in pairs
-        ]  # attrgetter returns a tuple for two or more names
+        # attrgetter returns a tuple for two or more names, and every owner has so many
+        self._owners = [(owner, names, attrgetter(*names)) for owner, names in pairs]
         self._values: list[tuple[Any, ...]] = [get(owner) for owner, _, get in self._owners]
         self._lists: list[tuple[Change, list[object], list[object]]] = []
         self._arrays: list[tuple[Change, np.ndarray]] = []

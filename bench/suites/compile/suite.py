@@ -21,7 +21,7 @@ from warp_gi.bench.harness.places import PLACES
 
 OBJECTS = (".o", ".obj", ".cubin", ".ptx")
 FRAME = "first frame"
-"""Stands for a module in the child: all that a frame of the default pipeline loads."""
+"""Name that stands, in place of a module's, for all modules that a frame of the default pipeline loads."""
 STATES = ("cold", "warm")
 
 

@@ -21,7 +21,7 @@ QUALITY = (
     *measured(COUNT, "share of rays", None, "traced share"),
     *measured(ERROR, "rays of a million", "lower", "wrong per million"),
 )
-"""What ``views.quality`` says of a picture."""
+"""Columns of the errors that ``views.quality`` returns."""
 SIZE = (*measured(COUNT, "cells", None, "cells"), *measured(MEMORY, "MB", "lower", "MB"))
 SCALING = (*keys("samples"), *seconds("bake "), *SIZE, *QUALITY)
 

@@ -42,7 +42,7 @@ def run(quick: bool = False, device: str = "cpu", parts: Sequence[str] = (), gal
 
 
 def case_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
-    """Return what is measured on each scene."""
+    """Return the rows of every scene."""
     rows: list[Row] = []
     for case in QUICK_CASES if quick else CASES:
         said = {"table": "modes", "case": case.name}
@@ -59,7 +59,7 @@ PARTS = {
 
 
 def place_rows(place: Case, quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
-    """Return what is measured on one scene; the sweeps are Sponza's."""
+    """Return the rows of one scene; sweeps are measured in Sponza alone."""
     if place.missing:
         return [{"table": "modes", "case": place.name, "skipped": place.missing}]
     camera = place.camera().at_resolution(*(QUICK_SIZE if quick else SIZE))
@@ -74,7 +74,7 @@ def place_rows(place: Case, quick: bool, device: str, gallery: Gallery = CLOSED)
 
 
 def as_paper(quick: bool) -> dict[str, Any]:
-    """Return what the paper bakes and does, with fewer samples for the quick form."""
+    """Return the paper's settings, with fewer surface samples for the quick form."""
     return PAPER | ({"samples": QUICK_SAMPLES} if quick else {})
 
 

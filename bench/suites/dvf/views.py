@@ -22,7 +22,7 @@ CASES = (
     Case("street_white", "street", 2.0, {"cell_size": 1.0}, DARK),
 )
 QUICK_SETTINGS: dict[str, Any] = {"cell_size": 4.0, "resolution": 36}
-"""Settings of fields that bake in seconds, and save less."""
+"""Settings of fields that bake in seconds and save fewer rays, for the quick form."""
 QUICK_CASES = tuple(replace(case, settings=QUICK_SETTINGS) for case in (CASES[0], CASES[3]))
 SIZE, QUICK_SIZE = (480, 270), (160, 90)
 """Picture size in pixels."""
@@ -59,7 +59,7 @@ class FieldView(View):
     """A view of visibility fields."""
 
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of its fields that are not the defaults."""
+    """Settings of the view's fields that are not the defaults."""
     _cells: dict[float, int] = field(default_factory=dict)
 
     def estimator(self, **settings: Any) -> gi.VisibilityField:

@@ -35,17 +35,17 @@ PAUSE = 0.2
 OURS = "ours"
 VARIANTS = (mitsuba_peer.LLVM, mitsuba_peer.SCALAR)
 CAMERA_SAMPLES = 8
-"""Camera rays a pixel that our 64 samples share; Mitsuba's have one each."""
+"""Camera rays a pixel that our 64 samples share; each of Mitsuba's samples has its own."""
 
 
 @dataclass(frozen=True)
 class Picture(Case):
-    """A picture of a place that all renderers make."""
+    """A place that all renderers make a picture of."""
 
     max_depth: int = 2
-    """Edges of the longest path, camera to light: 2 is direct light."""
+    """Number of edges of the longest path from camera to light: 2 is direct light."""
     peer: Mapping[str, Any] = field(default_factory=dict)
-    """Mitsuba's integrator."""
+    """Settings of Mitsuba's integrator."""
 
 
 def _path(depth: int) -> dict[str, Any]:
@@ -69,7 +69,7 @@ CASES = (
 )
 QUICK_CASES = (CASES[0], CASES[2], CASES[5], CASES[7])
 FIRST_FRAMES = {"atrium": "atrium", "crytek_sponza.glb": "sponza"}
-"""Places by their names in rows."""
+"""Places whose first frame is timed, by their names in rows."""
 
 
 def run(quick: bool = False, device: str = "cpu", parts: Sequence[str] = (), gallery: Gallery = CLOSED) -> list[Row]:

@@ -24,11 +24,11 @@ MODES = ("irradiance", "hybrid")
 SPP = 16
 """Samples a pixel, a pipeline's default; the mode "irradiance" traces them only where too few probes see a point."""
 MOST_BAKE = 40.0
-"""CPU seconds that a bake may take."""
+"""Largest number of CPU seconds that a bake may take."""
 DARK_TARGETS = {"probes": 0.015, "exact": 0.006}
-"""Light of the dark room over that of the lit one, by visibility."""
+"""Targets for the light of the dark room over that of the lit one, by visibility."""
 TOO_DARK = 0.05
-"""Share of the reference's mean from which on a pixel must not be 0."""
+"""Share of the reference's mean above which a pixel of the reference must not be 0 in ours."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from warp_gi.denoise import denoiser_named
 from warp_gi.errors import OptionError
 
 FRAME = 7
-"""Frame that is judged; the denoiser remembers those before it."""
+"""Number of the frame whose errors are measured; the denoiser averages over it and those before it."""
 RAYS = (1, 2, 8)
 DENOISERS = {"spatiotemporal": "ST", "oidn": "OIDN"}
 

@@ -26,7 +26,7 @@ from warp_gi.techniques.light_field.places import lit_data
 SPP = 4
 """Samples a pixel of the modes that trace rays."""
 PATH_SPP = 16
-"""Samples a pixel with which the path tracer's time and noise a sample are measured."""
+"""Samples a pixel of the pictures that the path tracer's time and noise are measured with."""
 QUICK_GRIDS = 1
 """Places whose light the quick form measures."""
 RESOLUTION = 128
@@ -37,7 +37,7 @@ WAYS = {
     "traced": {"mode": "traced", "through": "probes"},
     "traced, geometry": {"mode": "traced", "through": "geometry"},
 }
-"""Modes as the paper has them, whose rays march through the probes, and one whose rays go through the scene."""
+"""Settings by name: the paper's modes, whose rays march through the probes, and one with rays through the scene."""
 PAPER_CARD = "GeForce 1080"
 PAPER_MS = (
     ("Cornell Box", "2 x 2 x 2", 2048, 0.358, 0.000),
@@ -81,7 +81,7 @@ def _leak_row(views: dict[str, ProbeView], settings: dict[str, Any]) -> Row:
 
 
 def covered(stage: Stage) -> int:
-    """Return how many probes are inside of something."""
+    """Return the number of probes that are inside of something."""
     return int((stage.state.field.states.numpy() != 0).sum())
 
 

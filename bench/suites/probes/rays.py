@@ -18,7 +18,7 @@ from warp_gi.kernels import light_field_march as march_kernels
 from warp_gi.techniques.light_field.ray import march_rays
 
 SHARE, METRES = 0.02, 0.05
-"""Hits agree within this share of their distance or this many metres, whichever is more."""
+"""Largest difference of hits that agree: a share of their distance, or metres, whichever is more."""
 CASE = (4, 4, 4), 256
 RESOLUTIONS = (64, 256, 1024)
 COUNTS = ((1, 4, 1), (4, 4, 4), (8, 4, 8))
@@ -90,7 +90,7 @@ def ray_row(
     resolution: int,
     repetitions: int,
 ) -> Row:
-    """Return what a grid makes of the rays, and million rays a second of it and of the tree on one thread."""
+    """Return the share of rays that end in a grid as in the scene, and million rays a second of both on one thread."""
     settings = gi.LightFieldProbes(counts=counts, resolution=resolution, rays=1, bounces=1, through="probes")
     state = settings.start(view.scene, view.device, view.bake(settings)[0])
     view.bakes.clear()  # they are large

@@ -21,7 +21,7 @@ SEED = 7
 CORNELL = Case("cornell_box", materials=LAMBERT)
 LIVING_ROOM = Case("living_room", target=50.0, materials=LAMBERT)
 ROOM = Case("living_room_all", target=50.0, materials=LAMBERT)
-"""The other way, into the living room; `LIVING_ROOM` is near its windows."""
+"""View that looks the other way, into the living room; that of `LIVING_ROOM` is near its windows."""
 GLOSSY_LIVING_ROOM = Case("living_room_all", "living room, its materials", materials=PLAIN)
 SPONZA = Case("sponza", target=50.0, materials=LAMBERT)
 

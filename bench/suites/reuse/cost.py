@@ -27,7 +27,7 @@ BOTH = "VisibilityLightCache + GuidedPaths"
 
 
 def pipelines() -> dict[str, gi.Pipeline]:
-    """Return what figure 12 compares."""
+    """Return the pipelines that the paper's figure 12 compares, by name."""
     choices = {
         BASELINE: (gi.LightHierarchy(), gi.BsdfPaths()),
         "LightHierarchy + GuidedPaths": (gi.LightHierarchy(), gi.GuidedPaths()),
@@ -70,7 +70,7 @@ def place_cost(place: Case, size: tuple[int, int], frames: int, first: int, devi
 
 
 def pass_rows(case: str, run: FrameRun, first: int) -> list[Row]:
-    """Return a row for each pass that is no tracing, and one for all of them."""
+    """Return a row for each pass other than tracing, and one for all of them together."""
     frame = run.milliseconds("", first)
     passes = {
         name: ms for name, ms in run.stage_milliseconds(first).items() if name.startswith(("preprocess", "learn"))

@@ -46,7 +46,7 @@ OURS = (
     "VisibilityLightCache + GuidedPaths",
 )
 WORST = 1.2
-"""Ratio to the baseline's error that no combination of ours should exceed."""
+"""Target: largest ratio of an error of ours to the baseline's."""
 PAPER = (
     ("(a) warehouse", "VLC: almost one order of magnitude below SLL and LH; CDQ: no real benefit"),
     ("(b) mine", "VLC: useless, its NEE has no sky; CDQ: much below BRDF sampling where the sun's spot lights"),
@@ -132,7 +132,7 @@ def time_row(case: str, name: str, run: FrameRun, baseline: FrameRun, first: int
 
 
 def target_rows(rows: list[Row]) -> list[Row]:
-    """Return what was aimed at beside what the rows of combinations say."""
+    """Return targets beside the values that the rows of combinations have."""
     found = {(row["case"], row["combination"]): row for row in rows if "MSE beauty" in row}
     result: list[Row] = []
 

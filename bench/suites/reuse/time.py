@@ -26,12 +26,12 @@ from warp_gi.bench.suites.reuse.views import (
 )
 
 LAST = 30
-"""Frame up to which adaptation is watched."""
+"""Number of the last frame whose error is measured."""
 PAPER_ADAPTATION = {"first gain, frame": 1, "next gains, frame": 8, "refined until frame": 11}
 PAPER_TURNING = {9.0: 10, 36.0: 20}
-"""Frames until 128 bits have settled, by degrees."""
+"""Frames until quadtrees of 128 bits have settled in the paper, by degrees of the turn."""
 TARGET_TURNING = {1: 20, 8: 8}
-"""Frames until 128 bits shall have settled, by migrations."""
+"""Targets: frames until quadtrees of 128 bits have settled, by migrations a frame."""
 BITS = (32, 64, 96, 128)
 
 

@@ -17,7 +17,7 @@ from warp_gi.bench.suites.reuse.columns import TERMS
 MEASURED = TERMS
 SEED = 11
 TOLERANCE = 1.2
-"""A sequence has settled where its error stays below the settled error times this."""
+"""Factor on the settled error below which errors stay once a sequence has settled."""
 _NOT_OF_A_FRAME = ("bake", "compile", "scene")
 
 
@@ -57,7 +57,7 @@ class Truth:
 
     @property
     def halves(self) -> list[dict[str, np.ndarray]]:
-        """Pictures by term."""
+        """Two independent pictures by term, float64 [height, width, 3]."""
         if not self._halves:
             paths = gi.BsdfPaths(**{"max_depth": REFERENCE_DEPTH, **self.settings})
             pipeline = gi.Pipeline(indirect=paths, spp=self.spp, camera_samples=1)
@@ -123,7 +123,7 @@ class FrameRun:
         return {name: 1e3 * float(np.median([timings.get(name, 0.0) for timings in kept])) for name in names}
 
     def cost(self, first: int, device: str) -> float:
-        """Return the median of what counts of a frame's time, seconds."""
+        """Return the median seconds of a frame, of the kind that counts on the device (``measure.cost``)."""
         return cost(tuple(np.median(self.times[first:], axis=0)), device)
 
 
@@ -173,5 +173,5 @@ def written(series: Series, unit: float = 1.0) -> str:
 
 
 def ratio(a: float, b: float) -> float:
-    """Return a / b, and 1 where there is nothing in both."""
+    """Return a / b, or 1 where both are 0."""
     return 1.0 if max(a, b) <= 1e-12 else a / max(b, 1e-30)

@@ -11,20 +11,20 @@ from warp_gi.bench.harness.measure import Row, Series, median_and_spread
 from warp_gi.bench.report.plots import exponent
 
 SAME_SIZE = 1.05
-"""How far past the largest size ten times a smaller one may lie: generated sizes are not quite what was asked for."""
+"""Factor by which ten times a size may exceed the largest size, as generated sizes are not quite those asked for."""
 
 
 @dataclass(frozen=True)
 class Growth:
-    """Exponents, and what ten times a size costs, turn by turn: what slows the machine for a while slows all sizes."""
+    """Exponents and costs of ten times the size, turn by turn, as what slows the machine for a while slows all."""
 
     exponents: list[float]
     ratios: dict[float, list[float]]
-    """Ratios by the smaller size, for sizes of at most a tenth of the largest."""
+    """Cost of ten times a size over that of the size, by turn, for sizes up to a tenth of the largest."""
 
     @staticmethod
     def of(sizes: Sequence[float], turns: Sequence[Series]) -> Growth:
-        """Return the growth of what was measured at each of two sizes or more, rising, in one turn or several.
+        """Return the growth of values measured at two or more rising sizes, in one turn or several.
 
         Where sizes have had different numbers of turns, that of their medians.
         """
@@ -39,12 +39,12 @@ class Growth:
         return Growth([exponent(sizes, turn) or 0.0 for turn in np.exp(y).T], ratios)
 
     def ratio(self, start: float) -> float:
-        """Return the median of what ten times the size ``start`` costs."""
+        """Return the median cost of ten times the size ``start``, over that of ``start``."""
         return float(np.median(self.ratios[start]))
 
     @property
     def worst(self) -> float | None:
-        """The size of which ten times costs most, None if there is no size ten times another."""
+        """Size whose tenfold costs most; None if no size is ten times another."""
         return max(self.ratios, key=self.ratio, default=None)
 
     def row(self, target: float | str = "") -> Row:

@@ -27,12 +27,12 @@ LIGHTS, QUICK_LIGHTS = (10, 100, 1_000, 10_000, 100_000), (10, 100, 1_000)
 LIGHT_SIZE, QUICK_LIGHT_SIZE = (160, 90), (80, 45)
 LIGHT_TURNS, QUICK_LIGHT_TURNS = 8, 4
 BASELINES = {"PowerLights": gi.PowerLights(), "LightHierarchy": gi.LightHierarchy()}
-"""Ways to select lights that techniques are measured beside."""
+"""Names of the ways to select lights that techniques are compared with."""
 MEGAPIXELS, QUICK_MEGAPIXELS = (0.1, 0.3, 1.0, 2.0, 4.0, 8.0), (0.03, 0.3)
 BASE = "path"
-"""The preset that techniques are measured beside."""
+"""Name of the preset that techniques are compared with."""
 MANY_PIXELS = 1.5
-"""Megapixels from which a frame is measured once, not PIXEL_TURNS times."""
+"""Megapixels from which on a frame is measured once in place of PIXEL_TURNS times."""
 PIXEL_TURNS = 3
 THREAD_SIZE, QUICK_THREAD_SIZE = (240, 135), (80, 45)
 THREAD_BAKE = gi.VisibilityField(samples=160_000)
@@ -99,7 +99,7 @@ def _loaded_hall(count: int, device: str) -> gi.Scene:
 
 
 def _frame_of(scheduler: gi.FrameScheduler) -> Callable[[int], np.ndarray]:
-    """Return what renders a frame of some number and returns its beauty."""
+    """Return a function of a frame's number that renders the frame and returns its beauty."""
     return lambda index: scheduler.frame(index).numpy("beauty").copy()
 
 

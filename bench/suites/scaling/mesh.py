@@ -21,7 +21,7 @@ CROWD_VIEW = CameraKey(0.0, (-5.2, 2.4, 5.2), (1.5, 1.2, -1.5), hfov=75.0)
 
 HALL = (40.0, 6.0, 30.0)
 LAMP_AREA = 6.0
-"""Square metres, of all lamps together."""
+"""Area of all lamps together, m^2."""
 STRENGTHS = (4.0, 8.0, 16.0, 32.0)
 HALL_VIEW = gi.Camera.look_at((-18.0, 1.7, 13.0), (4.0, 1.5, -3.0), hfov=65.0)
 

@@ -33,7 +33,7 @@ BUILDS = 3
 MOST_GROWTH, MOST_BYTES = 1.8, 120.0
 """Targets: how many times longer a ray may take with ten times the triangles, and the tree's bytes a triangle."""
 QUERIES = {"any": "OCCLUDED", "closest": "INTERSECT"}
-"""Queries by our name, and Embree's names of them."""
+"""Names of queries: ours, and Embree's by ours."""
 CONTENDERS = ("ours", "embree")
 FEW, TIMES = 128, 4
 KINDS = ("primary", "diffuse", "diffuse, sorted", "diffuse, few")
@@ -125,7 +125,7 @@ def in_cells(origins: np.ndarray, directions: np.ndarray, cells: int = 32) -> tu
 
 
 def build_growth(meshes: Sequence[Mesh]) -> list[Row]:
-    """Return how builds and trees grow."""
+    """Return rows of the growth of build times and tree sizes."""
     counts, rows = [mesh.triangles for mesh in meshes], []
     for name in meshes[0].builds:
         said = {"table": "triangles: build growth", "renderer": name, "what": "build cost s"}

@@ -28,7 +28,7 @@ SCENE = str(PLACES["atrium"].source)
 CASES: dict[str, sequences.Sequence] = {
     name: case for _, module in catalogue.modules("sequence") for name, case in module.CASES.items()
 }
-"""Pipelines that suites' folders add, by their names in rows."""
+"""Pipelines of the sequence by their names in rows; suites' folders add them."""
 MOST_POINTS = 20
 STAGES = ("preprocess", "trace", "denoise", "write")
 _OTHERS = ("bake", "compile")
@@ -36,11 +36,11 @@ _OTHERS = ("bake", "compile")
 
 @dataclass(frozen=True)
 class Size:
-    """How much a sequence is."""
+    """Size of a sequence."""
 
     frames: int
     pixels: str
-    """Width and height, such as 240x135."""
+    """Picture size in pixels, such as 240x135."""
     spp: int
 
 
