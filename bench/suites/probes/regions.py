@@ -203,6 +203,6 @@ HEADLINES = (
         ),
         "denoising",
         "denoising",
-        "Dittebrandt et al. 2020",
+        "McGuire et al. 2017",
     ),
 )
