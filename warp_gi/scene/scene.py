@@ -355,11 +355,11 @@ class Scene:
         self.data(device)
         return self._devices[_device(device).alias].bvh
 
-    def resting_bvh(self, device: str | wp.Device | None = None) -> TriangleBvh:
+    def static_bvh(self, device: str | wp.Device | None = None) -> TriangleBvh:
         """Return a TriangleBvh of what never moves; ``bvh`` itself if nothing does."""
         with self.lock:
             self.data(device)
-            return self._devices[_device(device).alias].resting_bvh()
+            return self._devices[_device(device).alias].static_bvh()
 
     def _all_bounds(self) -> np.ndarray:
         flat = self._flat
