@@ -12,6 +12,7 @@ from safetensors.numpy import load_file, save
 
 from warp_gi.baking import Bake, load_bake
 from warp_gi.errors import BakeError, GiError
+from warp_gi.files import remove_stale_parts
 
 TYPES = "bool uint8 uint16 uint32 uint64 int8 int16 int32 int64 float16 float32 float64".split()
 SHAPES = [(), (0,), (0, 3), (1,), (7,), (5, 3), (2, 1, 3, 2)]
@@ -303,3 +304,26 @@ def test_importing_does_not_need_safetensors():
     script = "import sys, warp_gi.baking; print('safetensors' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "False"
+
+
+def test_nothing_stays_of_a_save_that_is_killed(tmp_path):
+    """safetensors writes to a temporary file of its own beside the path that it is given."""
+    code = """
+import os, pathlib, sys
+import numpy as np
+import safetensors.numpy
+from warp_gi.baking import Bake
+
+def killed(arrays, path, metadata):
+    pathlib.Path(path).with_name(".tmpKilled").write_bytes(b"half")
+    os._exit(9)
+
+safetensors.numpy.save_file = killed
+Bake("VisibilityField", "key", {}, {"cells": np.zeros(3)}).save(sys.argv[1])
+"""
+    path = tmp_path / "a.safetensors"
+    path.write_bytes(b"the one before")
+    assert subprocess.run([sys.executable, "-c", code, str(path)]).returncode == 9
+    assert len(os.listdir(tmp_path)) == 2
+    remove_stale_parts(path)
+    assert os.listdir(tmp_path) == ["a.safetensors"] and path.read_bytes() == b"the one before"

@@ -8,8 +8,10 @@ import pytest
 import statistics_tools as st
 
 import warp_gi as gi
+from warp_gi.cli.main import main
 from warp_gi.errors import BakeError, OptionError
 from warp_gi.estimator import Estimator
+from warp_gi.sequence.frames import read_frame
 
 PROBES = gi.LightFieldProbes(counts=(4, 4, 4), resolution=32, irradiance_resolution=16, visibility="exact")
 ENDS = gi.Pipeline(emitters=None, environment=None, indirect=gi.BsdfPaths(ends_in=PROBES), spp=8)
@@ -52,6 +54,24 @@ def test_a_cache_has_a_place_a_state_and_a_past_of_its_own():
 def test_what_ends_paths_is_a_radiance_cache():
     with pytest.raises(OptionError, match="ends_in must be a radiance cache or None, got PowerLights"):
         gi.BsdfPaths(ends_in=gi.PowerLights())
+
+
+def test_the_command_line_names_a_cache_and_its_settings(tmp_path, capsys):
+    command = ["render", "cornell_box", "--spp=1", "--resolution=24x16", "--frames=0", "--quiet", "-o"]
+    command += [str(tmp_path / "a.####.exr"), "--pipeline"]
+    flags = ["--indirect.ends-in.counts", "2", "2", "2", "--indirect.ends-in.resolution=16"]
+    assert main([*command, "path,indirect.ends_in=LightFieldProbes", *flags]) == 0
+    metadata = read_frame(tmp_path / "a.0000.exr").metadata
+    assert metadata["pipeline.indirect.ends_in"] == "LightFieldProbes"
+    assert metadata["pipeline.indirect.ends_in.resolution"] == 16
+    for pipeline, told in {
+        "path,indirect.ends_in=PowerLights": "unknown radiance cache 'PowerLights' (known: LightFieldProbes)",
+        "direct,indirect.ends_in=LightFieldProbes": "got indirect=none",
+        "path,emitters.ends_in=LightFieldProbes": "got emitters=PowerLights",
+        "path,indirect.ends=LightFieldProbes": "did you mean 'indirect.ends_in'",
+    }.items():
+        assert main([*command, pipeline]) == 2
+        assert told in capsys.readouterr().err
 
 
 @dataclass(frozen=True)

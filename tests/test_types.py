@@ -25,9 +25,12 @@ for frame in gi.render(scene, camera, pipeline, frames=[0], device="cpu"):
     picture: np.ndarray = frame.numpy("beauty")
     gi.PowerLights().trace(frame, None)
     gi.write_frame(frame, "shot.####.exr")
+    frame.data.radius = 2.0
     frame.numpy(3)  # wrong
     frame.data.radius = "wide"  # wrong
     gi.BsdfPaths().trace(scene, None)  # wrong
+    for _, estimator in pipeline.estimators():
+        estimator.trace(scene, None)  # wrong
     seconds: str = frame.timings["trace"]  # wrong
 gi.render(scene, camera, pipeline, frames=48)  # wrong
 gi.render(scene, "camera.json", pipeline)  # wrong

@@ -34,13 +34,13 @@ _TYPES = ("bool", *_WHOLE, "float16", "float32", "float64")
 
 @dataclass(eq=False)
 class Bake:
-    """What an estimator computed before the first frame, and what it is valid for."""
+    """Results that an estimator computed before the first frame, and the scene and settings that they are valid for."""
 
     technique: str
     """Class name of the estimator."""
     scene_key: str
     """Hash of just what the bake depends on; for visibility ``Scene.geometry_hash``."""
-    settings: dict[str, Setting]
+    settings: dict[str, Any]
     """Settings of the estimator that the bake depends on: str, int, float or bool, by name."""
     arrays: dict[str, np.ndarray]
     """Arrays by name: bool, int8 to int64, uint8 to uint64 or float16 to float64, of any shape."""
@@ -78,7 +78,7 @@ class Bake:
             "warp_gi": __version__,
         }
         record["sha256"] = _seal(record, _digest(arrays))
-        with replacing(path) as part:
+        with replacing(path, own_folder=True) as part:  # save_file writes to a file of another name first
             try:
                 save_file(arrays, part, {FORMAT: json.dumps(record, sort_keys=True)})
             except SafetensorError as error:
@@ -149,8 +149,8 @@ def load_bake(path: str | Path) -> Bake:
     if seal != (digest if FORMAT not in metadata else _seal(record, digest)):
         raise _damaged(path)
     try:
-        texts = [str(record[name]) for name in _TEXTS]
-        return Bake(*texts[:2], dict(record["settings"]), arrays, dict(record["counts"]), texts[2])
+        technique, scene_key, scene_name = (str(record[name]) for name in _TEXTS)
+        return Bake(technique, scene_key, dict(record["settings"]), arrays, dict(record["counts"]), scene_name)
     except (KeyError, TypeError, ValueError) as error:
         raise _damaged(path) from error
 
@@ -205,7 +205,7 @@ def _digest(arrays: Mapping[str, np.ndarray]) -> str:
     for name in sorted(arrays):
         array = _stored(name, arrays[name])
         digest.update(json.dumps([name, array.dtype.name, array.shape]).encode())
-        digest.update(array.reshape(-1).view(np.uint8))
+        digest.update(array.reshape(-1).view(np.uint8).data)
     return digest.hexdigest()
 
 

@@ -18,10 +18,10 @@ from warp_gi.kernels import bvh_native as layout
 from warp_gi.kernels import bvh_rays as batch
 from warp_gi.kernels import types
 
-SUBTREES = 64  # a build is shared out as about this many tasks
+SUBTREES = 64  # approximate number of tasks that a build is divided into
 MOST_TASKS = 1024
-ORDERED_RAYS = 1 << 15  # batches of fewer rays are traced as they come,
-ORDERED_BYTES = 1 << 25  # and so are those in trees of fewer bytes than this
+ORDERED_RAYS = 1 << 15  # rays are ordered before they are traced if a batch has at least so many
+ORDERED_BYTES = 1 << 25  # and the tree has at least so many bytes
 HUGE_PAGE = 1 << 21  # bytes
 
 

@@ -53,7 +53,7 @@ class Denoiser(Stateful):
 
 @dataclass(frozen=True)
 class History:
-    """What SpatioTemporal keeps of the last frame."""
+    """State of ``SpatioTemporal``: what it keeps of the last frame."""
 
     index: int
     """Number of the frame."""
@@ -78,7 +78,7 @@ class History:
 
 @dataclass(frozen=True)
 class SpatioTemporal(Denoiser):
-    """Averages over frames, then over neighbouring pixels; diffuse and glossy light apart.
+    """A filter over frames, then over neighbouring pixels; diffuse and glossy light apart.
 
     Diffuse light is filtered before it meets the albedo, glossy light before it meets the specular colour.
     Light that estimators do not separate is shared out by reflectance. Blurs shadows and reflections, and

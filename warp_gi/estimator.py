@@ -47,7 +47,7 @@ class Estimator(Stateful):
 
     @property
     def own_primary(self) -> Primary | None:
-        """What finds the frame's primary hits in place of camera rays, or None. Its state is the estimator's."""
+        """The primary that finds the frame's hits in place of camera rays, or None. Its state is the estimator's."""
         return None
 
     def fitting(self, bake: Bake) -> Estimator:

@@ -5,31 +5,38 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 
 @contextlib.contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
+def replacing(path: str | Path, own_folder: bool = False) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` to write to; it is renamed to ``path`` if the block succeeds.
 
     A file at ``path`` stays until the new one is complete and on disk. When the block
-    raises, the temporary file is removed. Missing folders are made.
+    raises, the temporary file is removed. Missing folders are made. ``own_folder`` puts the temporary file in a
+    folder of its own, for a writer that makes files beside it: if the process is killed, they are found with it.
     Raises OSError when the folder cannot be written to.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    part.write_bytes(b"")
+    if own_folder:
+        part.mkdir(exist_ok=True)
+    file = part / path.name if own_folder else part
     try:
-        yield part
-        with open(part, "rb+") as written:
+        file.write_bytes(b"")
+        yield file
+        with open(file, "rb+") as written:
             os.fsync(written.fileno())
-        os.replace(part, path)
+        os.replace(file, path)
     except BaseException:
-        part.unlink(missing_ok=True)
+        _remove(part)
         raise
+    if own_folder:
+        _remove(part)
 
 
 def check_writable(folder: Path) -> None:
@@ -48,7 +55,15 @@ def remove_stale_parts(path: str | Path) -> None:
     for candidate in path.parent.iterdir():
         match = name.fullmatch(candidate.name)
         if match and (int(match[1]) == os.getpid() or not _is_running(int(match[1]))):
-            candidate.unlink(missing_ok=True)
+            _remove(candidate)
+
+
+def _remove(part: Path) -> None:
+    """Remove a temporary file, or the folder of one."""
+    if part.is_dir():
+        shutil.rmtree(part)
+    else:
+        part.unlink(missing_ok=True)
 
 
 def _is_running(process: int) -> bool:

@@ -1,4 +1,4 @@
-"""What else a forked process needs: free locks, an EXR writer without threads, and to know that CUDA is lost."""
+"""Repairs in a forked process: free locks, an EXR writer without threads, and a note that CUDA is lost."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from typing import Any
 
 _guards: weakref.WeakSet[Guard] = weakref.WeakSet()
 has_lost_cuda = False
-"""Whether this process was forked after CUDA had started, from when on CUDA fails here."""
+"""Whether this process was forked after CUDA had started; CUDA calls fail here then."""
 
 
 class Guard:
-    """Holds a re-entrant lock for what is one process's and one object's own: pickled or forked, it is a free one.
+    """A re-entrant lock that belongs to one object in one process: after a pickle or a fork it is a free one.
 
-    Write ``with guard.lock:``, of which no interrupt leaves the lock taken, as it can where a class of its own
-    takes it.
+    Write ``with guard.lock:``. No interrupt leaves that lock taken, as it can where a class's own methods take it.
     """
 
     def __init__(self) -> None:

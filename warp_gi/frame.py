@@ -1,4 +1,4 @@
-"""A frame: one picture in the making, as estimators and kernels see it, then made."""
+"""A frame: the buffers of one picture, which estimators and kernels fill."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class FrameSettings:
 
 
 class Frame:
-    """One picture in the making, then made: named buffers on a device.
+    """One picture: named buffers on a device, which estimators add to until the frame is done.
 
     ``frame["beauty"]`` is a wp.array of height * width items in rows from the top (vec3,
     vec2, float32 or int32); ``frame.numpy("beauty")`` the same as an image.
@@ -209,7 +209,7 @@ class Frame:
 
     @property
     def tiled_items(self) -> int:
-        """Items of a launch in tiles: those of pixels, and of what tiles at the border have besides."""
+        """Number of items of a launch in tiles. Tiles at the border also have items outside the picture."""
         tiles = [math.ceil(size / gbuffer.TILE) for size in self.camera.resolution]
         return tiles[0] * tiles[1] * gbuffer.TILE**2
 

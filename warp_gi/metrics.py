@@ -18,7 +18,7 @@ from warp_gi.errors import OptionError, one_line
 
 
 class Image(Protocol):
-    """An array that says what is in it: of NumPy, Warp, PyTorch, JAX or another library."""
+    """An array of NumPy, Warp, PyTorch, JAX or another library that shares its memory by DLPack."""
 
     def __dlpack__(self) -> Any:
         """Return the memory as a DLPack capsule."""

@@ -1,4 +1,4 @@
-"""What a frame asks of the path tracer: terms of the light, and how paths choose lights and directions."""
+"""Requests of a frame to the path tracer: terms of the light, and how paths choose lights and directions."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class SamplerInUse(Generic[Sampler]):
 
 
 class PathRequest:
-    """What the estimators of a frame ask of its paths, which they share.
+    """Requests of a frame's estimators to its paths, which they share.
 
     Every path vertex samples lights and directions by what was asked for last. Without a request lights are sampled
     in proportion to their power, and directions by the BSDF.
@@ -142,7 +142,7 @@ class PathRequest:
 
 
 def sky_probability(scene: Scene | BakedScene) -> float:
-    """Return how often a path vertex samples the sky rather than an emitter: by power, but neither under a fifth.
+    """Return the probability that a path vertex samples the sky rather than an emitter: by power, from 0.2 to 0.8.
 
     A sky sends pi radius^2 times its integral over the sphere into the scene; walls keep most of that out of a room.
     """

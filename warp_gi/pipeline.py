@@ -169,7 +169,7 @@ class Pipeline:
 
     @property
     def camera_sample_count(self) -> int:
-        """Camera rays a pixel."""
+        """Number of camera rays a pixel."""
         return min(4, self.spp) if self.camera_samples is None else self.camera_samples
 
     @property

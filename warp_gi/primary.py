@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Primary(Stateful):
-    """Base of what finds the points that a frame shows: fills ``Frame.hits`` and the surface buffers."""
+    """Base of every primary: finds the points that a frame shows, and fills ``Frame.hits`` and the surface buffers."""
 
     is_whole: ClassVar[bool] = False
     """Whether it fills the buffers of light, too. Then no estimator is asked, and no path is traced."""

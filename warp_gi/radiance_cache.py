@@ -1,4 +1,4 @@
-"""Radiance caches: what is known of the light at surfaces, in which paths may end."""
+"""Radiance caches: they know the light at surfaces, so that paths may end there."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RadianceCache(Stateful):
-    """Base of what knows the indirect light at a surface, so that a path may end there.
+    """Base of every radiance cache: it knows the indirect light at surfaces, so that a path may end there.
 
     ``BsdfPaths(ends_in=...)`` holds one. Its bake and state are kept by the place where it stands,
     "indirect.ends_in", apart from those of an estimator of the same class.
     """
 
     def give(self, frame: Frame, state: Any) -> None:
-        """Hand what is known in this frame to its paths, by ``frame.paths.use_cache``; called once a camera sample."""
+        """Hand the cache to the frame's paths, by ``frame.paths.use_cache``; called once a camera sample."""
         raise NotImplementedError

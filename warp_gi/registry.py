@@ -1,4 +1,4 @@
-"""The registry: which techniques there are, by name. It imports none of their code.
+"""The registry of techniques, by name. It imports none of their code.
 
 ``warp_gi.techniques.TECHNIQUES`` lists folders. Each has a module ``technique`` with one ``Technique``, whose values
 are names and numbers.
@@ -18,7 +18,7 @@ from warp_gi.errors import unknown_name
 
 @dataclass(frozen=True)
 class Claim:
-    """What an estimator claims of its pictures, which the truth tests check."""
+    """A claim about the pictures of an estimator, which the truth tests check."""
 
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Settings under which the claim holds, where they are not the defaults."""
@@ -32,7 +32,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Entry:
-    """Where a class of a technique lies, and what it claims."""
+    """A class of a technique: its module, and its claims."""
 
     module: str
     """Name of the module that defines the class, relative to the technique's folder."""
@@ -42,7 +42,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Technique:
-    """One technique, by names alone."""
+    """A technique, described by names and numbers alone."""
 
     name: str
     """Long name of the technique, as in ``--technique``: "visibility-field"."""

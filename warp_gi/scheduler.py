@@ -137,7 +137,7 @@ class FrameScheduler:
             settings = part.bake_settings(self.scene)
             bake.check(type(part).__name__, part.bake_key(self.scene), settings, self.scene.name)
             part.check_view(bake, self.camera)
-        if bake is not None:  # what it depends on, the whole camera path for one, decides pixels, too
+        if bake is not None:  # a bake decides pixels, by all that it depends on: the whole camera path, for example
             self._bake_digests[f"bake.{place}"] = bake.digest[:16]
         return part.start(self.scene, device, bake, self.seed)
 

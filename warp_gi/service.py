@@ -1,4 +1,4 @@
-"""Services: what is built once a frame, whichever estimators ask for it."""
+"""Services: parts that are built once a frame, whichever estimators ask for them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from warp_gi.stateful import Stateful
 
 @dataclass(frozen=True)
 class Service(Stateful):
-    """Base of what several estimators share: built once a frame, before they preprocess.
+    """Base of every service: several estimators share it, and it is built once a frame before they preprocess.
 
     An estimator names the services that it needs (``Estimator.services``). ``preprocess`` and ``after`` run before
     those of estimators, and hand over what they made by ``Frame.offer``; estimators take it by ``Frame.offered``.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Ahead:
-    """What is known of a sequence before its first frame."""
+    """Knowledge of a sequence before its first frame."""
 
     state: Any
     """State before the first frame, of the part that the question is about."""

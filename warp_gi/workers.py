@@ -26,7 +26,7 @@ class Slices:
         """Whether a fork copied this job, so that some of its slices were on workers that the copy does not have."""
         self._run = run
         self._next, self._count = 0, count
-        self._workers = 0  # that are in slices
+        self._workers = 0  # number of workers that are running a slice
         self._lock = threading.Lock()
         self._workers_at_it = threading.Lock()  # taken while there are any
 
@@ -69,7 +69,7 @@ class Slices:
                     self._next = self._count
                 with self._workers_at_it:
                     break
-            except BaseException as error:  # until workers are done they write to arrays that the caller owns
+            except BaseException as error:  # workers write to the caller's arrays until they are done
                 interrupt = error
         self._run = _nothing  # offers that no worker has looked at yet keep no arrays
         if interrupt is not None:
@@ -133,7 +133,7 @@ def _serve(offers: SimpleQueue[Slices]) -> None:
     while True:
         slices = offers.get()
         slices.work()
-        del slices  # it holds the launch's arrays
+        del slices  # the slices hold the arrays of the launch
 
 
 def _forget_workers() -> None:

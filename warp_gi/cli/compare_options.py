@@ -1,4 +1,4 @@
-"""Options of ``warp-gi bench compare``, and what they name: shared with the processes that it starts."""
+"""Options of ``warp-gi bench compare``, and the scenes and pipelines that they name; its processes share them."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class CompareBench(SceneOptions):
     scene: Annotated[str, flag("SCENE", DEFAULT_SCENE)] = ""
     """A GLB, glTF, OBJ or PLY file, or the name of a built-in scene."""
     frame: int = 0
-    """Number of the frame, of a camera path and of what moves."""
+    """Number of the frame: of the camera path, and of the scene's animation."""
     size: Annotated[str, flag("WxH", f"the reference's, else {SIZE}", "--resolution")] = ""
     """Width and height of the pictures in pixels."""
     pipelines: Annotated[str, flag("NAMES", "path,dvf,hybrid")] = "path,dvf,hybrid"
@@ -75,7 +75,7 @@ class CompareBench(SceneOptions):
 
 @dataclass(frozen=True)
 class Inputs:
-    """What the options name."""
+    """The scene, camera and pipelines that the options name."""
 
     scene: Scene
     camera: Camera

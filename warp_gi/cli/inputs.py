@@ -1,4 +1,4 @@
-"""What commands are given: scenes, skies, cameras."""
+"""Inputs of commands: scenes, skies, cameras."""
 
 from __future__ import annotations
 

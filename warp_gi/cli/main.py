@@ -108,7 +108,7 @@ def _message(error: BaseException | str) -> str:
     if isinstance(error, MemoryError):
         return f"not enough memory {error}".strip()
     if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename2 or error.filename}: {error.strerror}"  # of a rename, the target
+        return f"{error.filename2 or error.filename}: {error.strerror}"  # filename2 is the target of a rename
     return one_line(error)
 
 

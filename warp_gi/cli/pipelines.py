@@ -27,7 +27,7 @@ def pipeline_named(text: str) -> Pipeline:
         if place == "denoise":
             pipeline = replace(pipeline, denoise=find_denoiser(value))
         elif term not in TERMS or inner not in ("", "ends_in"):
-            raise unknown_name("term of a pipeline", place, (*TERMS, *(f"{one}.ends_in" for one in TERMS), "denoise"))
+            raise unknown_name("term of a pipeline", place, (*TERMS, "indirect.ends_in", "denoise"))
         elif inner:
             pipeline = _ending(pipeline, term, value)
         else:
@@ -40,9 +40,9 @@ def pipeline_named(text: str) -> Pipeline:
 def _ending(pipeline: Pipeline, term: str, name: str) -> Pipeline:
     """Return a pipeline whose paths of a term end in the radiance cache of that name, or in none."""
     estimator = getattr(pipeline, term)
-    if not any(one.name == "ends_in" for one in fields(estimator) if estimator is not None):
-        kind = "no estimator" if estimator is None else type(estimator).__name__
-        raise OptionError(f"{term}.ends_in needs an estimator that traces paths, as BsdfPaths does, not {kind}")
+    if estimator is None or "ends_in" not in {one.name for one in fields(estimator)}:
+        kind = "none" if estimator is None else type(estimator).__name__
+        raise OptionError(f"{term}.ends_in needs an estimator that traces paths, as BsdfPaths does, got {term}={kind}")
     cache = None if name.lower() == "none" else _cache_named(name)
     return replace(pipeline, **{term: replace(estimator, ends_in=cache)})
 

@@ -88,8 +88,8 @@ class Render(SceneOptions):
     exposure: float = 0.0
     """Exposure of previews in stops."""
     reuse_pictures: Annotated[Path | None, flag("FOLDER", "none")] = None
-    """Write pictures of what the last frame's samples taught: the octree's leaves, samples and lights in them, shares
-    of exploration and of the BSDF. The pipeline has to learn, as reuse and hybrid do."""
+    """Folder for pictures of what the last frame's samples taught: the octree's leaves, samples and lights in them,
+    shares of exploration and of the BSDF. The pipeline has to learn, as reuse and hybrid do."""
     reuse_pixel: Annotated[tuple[int, int] | None, flag("X Y", "none")] = None
     """Pixel x y whose quadtree to draw, beside the light that comes to the point seen there. 0 0 is at the top left."""
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -187,7 +187,7 @@ def find_output(options: Render) -> Output:
 
 
 def turn_sky(options: Render, scene: Scene | BakedScene, camera: Camera | CameraPath) -> None:
-    """Let the sky turn, if it was asked to."""
+    """Make the sky turn, if ``--environment-turn`` says so."""
     turn, sky = options.environment_turn, scene.environment
     if not math.isfinite(turn):
         raise OptionError(f"--environment-turn must be a finite number of degrees, got {turn:g}")

@@ -1,4 +1,4 @@
-"""What commands print: a progress bar on a terminal, plain lines elsewhere, tables, or nothing."""
+"""Output of commands: a progress bar on a terminal, plain lines elsewhere, tables, or nothing."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from warp_gi import launch
 
 LINE_SECONDS = 10.0
 LOG_WIDTH, LONGEST_WORD, GAP = 200, 24, 3
-"""Characters of a table's line where no terminal limits it, of a word in one that is not broken, between columns."""
+"""Characters in a table's line where no terminal limits it, in the longest unbroken word, and between columns."""
 _M_MMAP_THRESHOLD = -3
 _LARGE_BLOCK = 1 << 20
 
@@ -67,7 +67,7 @@ class Reporter:
 
     @contextmanager
     def shares(self, name: str) -> Iterator[Callable[[float], None]]:
-        """Yield what is told the share done of ``name``: a bar on a terminal, a line every 10 s or more elsewhere."""
+        """Yield a function that takes the share of ``name`` done, and shows it: a bar, or a line every 10 s or more."""
         started = told = time.perf_counter()
         if self.terminal:
             from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
@@ -254,7 +254,7 @@ def run_command(options: Options, run: Callable[[Options, Reporter], None]) -> i
 
 
 def start_warp(device: str = "cpu", threads: int | None = None) -> None:
-    """Start Warp without its greeting, module log, or word on a missing CUDA driver; check that the device is there.
+    """Start Warp without its greeting, its module log and its message about CUDA; check that the device is there.
 
     ``threads`` is how many the CPU may use; None leaves that as it is. Raises OptionError for a device that is not
     there, or a number of threads out of range.

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class BakedScene:
-    """Stands for the scene of a bake that holds enough to be rendered alone: no geometry, no lights, no sky.
+    """A scene of which only a bake is left. It has no geometry, no lights and no sky, and still can be rendered.
 
     Raises BakeError for a bake that does not say where its scene was.
     """
@@ -46,12 +46,12 @@ class BakedScene:
 
     @property
     def lock(self) -> threading.RLock:
-        """A re-entrant lock, as that of a ``Scene``."""
+        """The re-entrant lock of the scene, as in ``Scene.lock``."""
         return self._guard.lock
 
     @property
     def bounds(self) -> np.ndarray:
-        """Lowest and highest corner, float32 [2, 3], metres."""
+        """Lowest and highest corner of the scene in metres, float32 [2, 3]."""
         return self.bake.arrays["bounds"]
 
     def update(self, time: float, previous_time: float | None = None, device: wp.DeviceLike = None) -> bool:

@@ -32,8 +32,11 @@ class CameraKey:
     time: float
     """Time of the key in seconds."""
     eye: Vec3
+    """Position of the camera in metres."""
     target: Vec3
+    """Point in metres that the camera looks at."""
     up: Vec3 = (0.0, 1.0, 0.0)
+    """Direction that is up in the picture, of any length."""
     hfov: float = 65.0
     """Horizontal field of view in degrees."""
 
@@ -46,10 +49,13 @@ class CameraPath:
     """
 
     keys: tuple[CameraKey, ...]
+    """Poses of the camera, their times rising."""
     fps: float = 24.0
     """Frames per second: frame i is at time ``i / fps``."""
     resolution: tuple[int, int] = (960, 540)
+    """Width and height in pixels."""
     name: str = field(default="", compare=False)
+    """Name in messages and reports."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "keys", tuple(self.keys))

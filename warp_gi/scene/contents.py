@@ -1,4 +1,4 @@
-"""What the buffers on devices, and the watch over edits, know of a scene."""
+"""The protocol by which the buffers on devices, and the watch over edits, read a scene."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class SceneContents(Protocol):
-    """A ``Scene``, as those see it that it is made of."""
+    """A ``Scene`` as its own parts see it: the buffers on devices, and the watch over edits."""
 
     name: str
     nodes: list[Node]
@@ -37,7 +37,7 @@ class SceneContents(Protocol):
 
     @property
     def environment(self) -> Environment | None:
-        """The sky now."""
+        """The present sky."""
         ...
 
     @property
@@ -52,12 +52,12 @@ class SceneContents(Protocol):
 
     @property
     def bounds(self) -> np.ndarray:
-        """Lowest and highest corner, float32 [2, 3], metres."""
+        """Lowest and highest corner in metres, float32 [2, 3]."""
         ...
 
     @property
     def radius(self) -> float:
-        """Half the diagonal of the bounds, metres."""
+        """Half the diagonal of the bounds in metres."""
         ...
 
     def emitter_powers(self) -> np.ndarray:

@@ -110,7 +110,7 @@ class DeviceScene:
         world = animation.world_matrices(nodes, time)
         previous_world = animation.world_matrices(nodes, previous_time)
         was, was_before = self.world, self.previous_world
-        # until all is moved no pose is known: the next call after an interrupt or a fork places everything
+        # No pose is known until everything is moved: the call after an interrupt or a fork then places all nodes.
         self.world = self.previous_world = [np.full((4, 4), np.nan)] * len(nodes)
         moved = changed = False
         for index, node in enumerate(nodes):

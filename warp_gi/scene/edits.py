@@ -39,7 +39,7 @@ class Edit(NamedTuple):
 
 
 class _Slot(NamedTuple):
-    """Where a mesh of a node lies in the flat geometry."""
+    """The place of a node's mesh in the flat geometry."""
 
     mesh: Mesh
     vertices: slice
@@ -49,7 +49,7 @@ class _Slot(NamedTuple):
 
 
 class Edits:
-    """What a scene was made from; made anew whenever the scene reads its nodes again."""
+    """The objects that a scene was made from. Made anew whenever the scene reads its nodes again."""
 
     def __init__(self, scene: SceneContents) -> None:
         self.scene = scene
@@ -95,7 +95,7 @@ class Edits:
                     f"scene {self.scene.name!r}: {edit.what} after the scene was built, "
                     f"and pictures would not show it; {edit.cure}"
                 )
-        if changes and self.scene._devices:  # of no account, such as an equal copy of an array
+        if changes and self.scene._devices:  # these edits do not matter, such as an equal copy of an array
             self._watch_all()
 
     def _edit(self, change: Change) -> Edit | None:
@@ -233,7 +233,7 @@ class Edits:
                 field = _row_edit(material, data, row, hint)
         for _, mesh, slot in self._meshes():
             if field is None and mesh.material is material and not _alike(material, scene.materials[slot.row]):
-                field = hint  # of a material that meshes have in place of the scene's own
+                field = hint  # meshes have this material in place of the scene's own
         return None if field is None else Edit(f"{field} of material {material.name!r} changed")
 
     def _emission_edit(self) -> Edit | None:

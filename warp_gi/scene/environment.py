@@ -36,11 +36,11 @@ from warp_gi.scene.watching import Watch
 __all__ = ["Environment", "SunSky", "as_environment"]
 
 LARGEST_HEIGHT = 4096  # texel coordinates must be exact in float32 with bits left to interpolate
-NEGLIGIBLE_NEGATIVE = 1e-4  # of the sum of all pixels
+NEGLIGIBLE_NEGATIVE = 1e-4  # share of the sum of all pixels; less is set to 0
 
 
 class SkyMap:
-    """Pixels and what is derived from them once: shared by all rotations and scales of one map."""
+    """The pixels of a map, and what is derived from them once; shared by all rotations and scales of the map."""
 
     def __init__(self, pixels: np.ndarray) -> None:
         self.pixels = pixels
@@ -53,13 +53,13 @@ class SkyMap:
 
     @cached_property
     def mean(self) -> np.ndarray:
-        """float64 [3]: the radiance averaged over the sphere, exact for the bilinear map."""
+        """Radiance averaged over the sphere, W/(m^2 sr), float64 [3]; exact for the bilinear map."""
         height, width = self.pixels.shape[:2]
         return self.pixels.sum(1, dtype=np.float64).T @ node_solid_angles(height, width) / (4 * math.pi)
 
     @cached_property
     def harmonics(self) -> np.ndarray:
-        """float64 [3, 9]: spherical harmonics in the map's own space."""
+        """Spherical harmonics in the map's own space, float64 [3, 9]."""
         return harmonics.project(self.pixels)
 
     def on(self, device: wp.Device) -> tuple[wp.array, wp.array, float]:
@@ -148,14 +148,14 @@ class Environment:
 
     @property
     def mean_radiance(self) -> np.ndarray:
-        """float64 [3]: the radiance averaged over the sphere, W/(m^2 sr)."""
+        """Radiance averaged over the sphere, W/(m^2 sr), float64 [3]."""
         if self._map is not None:
             return self._map.mean * self.scale
         return np.array(self.color or (0.0, 0.0, 0.0)) * self.scale
 
     @property
     def harmonics(self) -> np.ndarray:
-        """float64 [3, 9]: its low frequencies in world space, W/(m^2 sr), a row each for red, green, blue.
+        """Low frequencies of the sky in world space, W/(m^2 sr), float64 [3, 9]; a row each for red, green, blue.
 
         Ordered as in ``kernels/harmonics.py``. Beside a sharp bright sun they swing below zero, as a sum of
         nine smooth functions must.
@@ -176,7 +176,7 @@ class Environment:
 
     @property
     def appearance(self) -> tuple[object, ...]:
-        """All that determines the radiance, to the last bit of a rotation; equal for skies that look the same."""
+        """Values that determine the radiance to the last bit; equal for skies that look the same."""
         return self.rotation, self.scale, self.color, self._map and self._map.digest
 
     def rotated(self, degrees: float) -> Environment:
@@ -193,7 +193,7 @@ class Environment:
 
     @property
     def world_from_environment(self) -> np.ndarray:
-        """float64 [3, 3] rotation of the sky's own directions into world space."""
+        """Rotation of the sky's own directions into world space, float64 [3, 3]."""
         angle = math.radians(self.rotation)
         c, s = math.cos(angle), math.sin(angle)
         return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])

@@ -1,4 +1,4 @@
-"""Which triangles have holes."""
+"""Triangles with holes, and the textures that cut them."""
 
 from __future__ import annotations
 

@@ -14,6 +14,7 @@ class Texture:
     """An 8-bit image."""
 
     name: str
+    """Name in error messages."""
     pixels: np.ndarray
     """RGBA values, uint8 [height, width, 4], row 0 at the top as in files."""
     srgb: bool = True
@@ -27,10 +28,13 @@ class Material:
     """A glTF 2.0 metallic-roughness material."""
 
     name: str = "material"
+    """Name in error messages."""
     base_color: Color = (0.8, 0.8, 0.8)
     """Linear Rec. 709 reflectance, multiplied with ``base_color_texture``."""
     alpha: float = 1.0
+    """Coverage in [0, 1], multiplied with the alpha of ``base_color_texture``."""
     metallic: float = 0.0
+    """Metallic factor in [0, 1], multiplied with ``metallic_roughness_texture``."""
     roughness: float = 1.0
     """Perceptual roughness in [0, 1]; the GGX alpha is its square."""
     specular: float = 1.0
@@ -38,11 +42,15 @@ class Material:
     emission: Color = (0.0, 0.0, 0.0)
     """Emitted radiance in W/(m^2 sr), multiplied with ``emission_texture``."""
     base_color_texture: Texture | None = None
+    """Texture of base colour and alpha, sRGB-coded."""
     metallic_roughness_texture: Texture | None = None
     """Texture of the roughness (green) and of the metallic factor (blue); linear."""
     normal_texture: Texture | None = None
+    """Texture of normals in tangent space, x right and y up; linear."""
     emission_texture: Texture | None = None
+    """Texture of the emission, sRGB-coded."""
     normal_scale: float = 1.0
+    """Factor on the x and y of the normal texture's normals."""
     alpha_cutoff: float | None = None
     """Alpha below which a ray passes through the surface; None is opaque."""
     double_sided: bool = True
@@ -58,11 +66,13 @@ class Mesh:
     indices: np.ndarray
     """Vertices of each triangle, int32 [triangle, 3], counter-clockwise seen from the front."""
     material: Material = field(default_factory=Material)
+    """Material of all triangles."""
     normals: np.ndarray | None = None
     """Unit shading normals, float32 [vertex, 3]; None is flat shading."""
     uvs: np.ndarray | None = None
     """Texture coordinates, float32 [vertex, 2], v up; None is all zero."""
     name: str = "mesh"
+    """Name in error messages."""
 
 
 @dataclass(eq=False)
@@ -74,14 +84,17 @@ class PunctualLight:
     intensity: Color
     """Intensity in W/sr a channel (point, spot), or irradiance in W/m^2 perpendicular to the light (directional)."""
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Position in metres, in the space of ``node``; of no account for a directional light."""
     direction: tuple[float, float, float] = (0.0, 0.0, -1.0)
     """Direction in which the light shines, of any length."""
     inner_cone: float = 0.0
     """Half angle in radians at which a spot begins to fall off."""
     outer_cone: float = 0.7853981633974483
+    """Half angle in radians at which a spot ends; the default is 45 degrees."""
     range: float | None = None
     """Distance in metres at which the light ends; None is no limit."""
     name: str = "light"
+    """Name in error messages."""
     node: int | None = None
     """Index in Scene.nodes of the node that carries the light, and in whose space it is given; None is the world."""
 
@@ -91,7 +104,9 @@ class Node:
     """A named placement of meshes; the objects of a scene. Parents come before children."""
 
     name: str
+    """Name of the node, by which ``Scene.animate`` finds it."""
     meshes: list[Mesh] = field(default_factory=list)
+    """Meshes that the node places."""
     parent_from_node: np.ndarray = field(default_factory=lambda: np.eye(4))
     """Placement at rest, float64 [4, 4], acting on column vectors."""
     parent: int | None = None
@@ -107,6 +122,8 @@ class Keyframe:
     time: float
     """Time of the pose in seconds."""
     translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Position in metres, in the space of the parent."""
     rotation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     """Rotation as a unit quaternion x, y, z, w."""
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Factors on the size along x, y and z, before the rotation."""

@@ -10,7 +10,7 @@ from warp_gi.errors import OptionError
 from warp_gi.scene.model import Mesh
 
 NORMAL_STEPS = 511
-"""Steps of each component of a normal within which corners of a vertex share it again."""
+"""Steps per unit to which components of normals are rounded, to tell which corners of a vertex can share one."""
 
 
 def smooth_mesh(mesh: Mesh, angle: float) -> Mesh:
@@ -59,7 +59,7 @@ def _face_normals(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _corner_normals(position: np.ndarray, normals: np.ndarray, weights: np.ndarray, angle: float) -> np.ndarray:
     """Return unit normals [corner, 3] from those of the corners' faces; ``position`` numbers the welded vertices."""
     order = np.argsort(position, kind="stable")
-    ends = np.searchsorted(position[order], position[order], side="right")  # of the run of corners at one position
+    ends = np.searchsorted(position[order], position[order], side="right")  # end of the run of corners at one position
     sorted_normals = normals[order]
     weighted = sorted_normals * weights[order, None]
     total = weighted.copy()

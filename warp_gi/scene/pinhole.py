@@ -34,6 +34,7 @@ class Camera:
     resolution: tuple[int, int] = (960, 540)
     """Width and height in pixels."""
     name: str = ""
+    """Name in messages and reports."""
 
     def __post_init__(self) -> None:
         matrix = np.array(self.world_from_camera, dtype=np.float64)
@@ -82,7 +83,7 @@ class Camera:
 
     @property
     def position(self) -> np.ndarray:
-        """The eye, float64 [3], metres."""
+        """Position of the eye in metres, float64 [3]."""
         return self.world_from_camera[:3, 3]
 
     def directions(self, pixels: np.ndarray) -> np.ndarray:

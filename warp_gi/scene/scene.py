@@ -31,7 +31,7 @@ POSES_FOR_BOUNDS = 33
 
 
 class Scene:
-    """Everything that is rendered. Lengths in metres, y up, colours linear Rec. 709.
+    """A scene: everything that is rendered. Lengths in metres, y up, colours linear Rec. 709.
 
     Args:
         nodes: Placements of meshes; parents before children. The scene keeps copies of the nodes, not of the meshes.
@@ -98,7 +98,7 @@ class Scene:
 
     @property
     def lock(self) -> threading.RLock:
-        """A re-entrant lock: whoever holds it, as each frame and bake does, is the only one to move or edit the scene.
+        """A re-entrant lock. Its holder alone may move or edit the scene, as each frame and bake does.
 
         Take it around ``update`` and what is read after it, where other threads render.
         """
@@ -106,7 +106,7 @@ class Scene:
 
     @property
     def environment(self) -> Environment | None:
-        """The sky now; set it to a path, an RGB radiance, an Environment, a SunSky or None. The geometry stays built.
+        """The present sky. Set it to a path, an RGB radiance, an Environment, a SunSky or None; geometry stays built.
 
         Set to a function of the time in seconds that returns one of these, as a ``gi.TurningSky`` does, it is another
         from frame to frame: that of time 0 at first, then that of the last ``update_sky``. For one time the function
@@ -128,7 +128,7 @@ class Scene:
         return self._sky_at is not None
 
     def update_sky(self, time: float) -> bool:
-        """Let the environment be that of ``time`` [s], if it is a function of time; return whether it is another now.
+        """Move the sky to ``time`` [s], if it is a function of time; return whether it is another one now.
 
         Each frame does so before anything is baked or traced. Raises SceneError for what is no sky.
         """
@@ -143,7 +143,7 @@ class Scene:
             return is_other
 
     def _show(self, sky: Environment | None) -> None:
-        """Make a sky that of now, for everything derived from the scene and on every device."""
+        """Make a sky the present one, for everything derived from the scene and on every device."""
         self._sky_shown = ("in the making",)  # an interrupt may leave it half done
         self._environment = sky
         self.version += 1
@@ -165,12 +165,12 @@ class Scene:
 
     @property
     def bounds(self) -> np.ndarray:
-        """Lowest and highest corner, float32 [2, 3], metres; of an animated scene over all of its time."""
+        """Lowest and highest corner in metres, float32 [2, 3]; of an animated scene over all of its time."""
         return self._bounds.copy()
 
     @property
     def radius(self) -> float:
-        """Half the diagonal of the bounds, metres."""
+        """Half the diagonal of the bounds in metres."""
         return float(np.linalg.norm(self._bounds[1].astype(np.float64) - self._bounds[0])) / 2.0
 
     @property
@@ -195,7 +195,7 @@ class Scene:
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes of the geometry, materials and textures on one device, without the ray query tree and the sky."""
+        """Bytes of geometry, materials and textures on one device, without the tree of ray queries and the sky."""
         flat = self._flat
         arrays = (flat.points, flat.normals, flat.uvs, flat.indices, flat.materials, flat.objects)
         texels = {id(t.pixels): t.pixels.nbytes for t in textures.distinct_textures(self.materials)}
@@ -213,7 +213,7 @@ class Scene:
 
     @property
     def geometry_hash(self) -> str:
-        """sha256 of all that decides visibility: triangles, alpha masks, animation."""
+        """SHA-256 of all that decides visibility: triangles, alpha masks, animation."""
         if self._geometry_hash is None:
             digest = hashlib.sha256(b"warp_gi geometry 1")
             flat = self._flat
@@ -237,16 +237,16 @@ class Scene:
 
     @property
     def hash(self) -> str:
-        """sha256 of all that decides the pictures but the cameras; equal in every process."""
+        """SHA-256 of all that decides the pictures, except the cameras; equal in every process."""
         digest = hashlib.sha256(self.contents_hash.encode())
         _update(digest, "no sky" if self._environment is None else self._environment.content_hash)
         return digest.hexdigest()
 
     @property
     def contents_hash(self) -> str:
-        """sha256 of all that decides the pictures but cameras and sky.
+        """SHA-256 of all that decides the pictures, except cameras and sky.
 
-        Kept: a sky that changes from frame to frame must not cost a pass over all textures.
+        It is computed once: a sky that changes from frame to frame must not cost a pass over all textures.
         """
         if self._contents_hash is None:
             digest = hashlib.sha256(b"warp_gi scene 1" + self.geometry_hash.encode())
@@ -286,7 +286,7 @@ class Scene:
 
     @property
     def moving_objects(self) -> dict[int, int]:
-        """Node of each object (by object id) that can move."""
+        """Indices of the nodes of objects that can move, by object id."""
         objects = [index for index, node in enumerate(self.nodes) if node.meshes]
         return {number: index for number, index in enumerate(objects) if self._moving[index]}
 
@@ -356,7 +356,7 @@ class Scene:
         return self._devices[_device(device).alias].bvh
 
     def static_bvh(self, device: str | wp.Device | None = None) -> TriangleBvh:
-        """Return a TriangleBvh of what never moves; ``bvh`` itself if nothing does."""
+        """Return the TriangleBvh of the nodes that never move; it is ``bvh`` itself if nothing moves."""
         with self.lock:
             self.data(device)
             return self._devices[_device(device).alias].static_bvh()

@@ -98,14 +98,14 @@ class SunSky:
 
     @property
     def direction(self) -> np.ndarray:
-        """float64 [3] unit direction towards the sun."""
+        """Unit direction towards the sun, float64 [3]."""
         elevation, azimuth = math.radians(self.elevation), math.radians(self.azimuth)
         flat = math.cos(elevation)
         return np.array([flat * math.sin(azimuth), math.sin(elevation), -flat * math.cos(azimuth)])
 
     @property
     def sun_irradiance(self) -> np.ndarray:
-        """float64 [3]: of a surface facing the sun, by the sun alone, W/m^2 a channel."""
+        """Irradiance of a surface that faces the sun, by the sun alone, W/m^2 a channel, float64 [3]."""
         scale = self.intensity * self.sun_intensity / EFFICACY
         return np.maximum(RGB_FROM_XYZ @ _sun_xyz(math.radians(90 - self.elevation), self.turbidity), 0) * scale
 

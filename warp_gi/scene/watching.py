@@ -1,4 +1,4 @@
-"""Watches objects for edits: which of their fields are not what they were, in-place edits of arrays and lists included.
+"""Watches objects for edits: tells which of their fields changed, in-place edits of arrays and lists included.
 
 A field counts as changed when it holds another object, another list of the same objects, or an array with other
 bytes. Whether that matters is for the caller to find out: an equal copy of an array counts as changed, too.
@@ -26,7 +26,9 @@ class Change(NamedTuple):
     """A field that may have been edited."""
 
     owner: object
+    """Object whose field may have been edited."""
     field: str
+    """Name of the field."""
 
 
 Owner = object | tuple[object, tuple[str, ...]]
@@ -44,7 +46,8 @@ class Watch:
 
     def __init__(self, owners: Sequence[Owner], bare: bool = False) -> None:
         pairs = [owner if isinstance(owner, tuple) else (owner, _field_names(owner)) for owner in owners]
-        self._owners = [(owner, names, attrgetter(*names)) for owner, names in pairs]  # of two names at least
+        # attrgetter returns a tuple for two or more names, and every owner has so many
+        self._owners = [(owner, names, attrgetter(*names)) for owner, names in pairs]
         self._values: list[tuple[Any, ...]] = [get(owner) for owner, _, get in self._owners]
         self._lists: list[tuple[Change, list[object], list[object]]] = []
         self._arrays: list[tuple[Change, np.ndarray]] = []
@@ -73,7 +76,7 @@ class Watch:
 
     @property
     def nbytes(self) -> int:
-        """Bytes that are read to find edits of arrays."""
+        """Number of bytes that are read to find edits of arrays."""
         return sum(array.nbytes for _, array in self._arrays)
 
     def changes(self) -> list[Change]:
@@ -97,7 +100,7 @@ class _Checksums:
         self.arrays = arrays
         self.sizes = [array.nbytes for array in arrays]
         counts = [-(-size // CHUNK) for size in self.sizes]
-        self.index = np.repeat(np.arange(len(arrays)), counts)  # of each chunk's array
+        self.index = np.repeat(np.arange(len(arrays)), counts)  # index in `arrays` of each chunk's array
         table = np.zeros(len(self.index), checksum.MemoryChunk.numpy_dtype())
         starts = np.array([array.__array_interface__["data"][0] for array in arrays], np.uint64)
         sizes = np.array(self.sizes, np.int64)

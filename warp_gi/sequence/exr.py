@@ -112,7 +112,7 @@ def write_exr(
     spec.channelnames = tuple(names)
     spec.channelformats = tuple(formats)
     spec.attribute("compression", "zip")
-    spec.attribute("DateTime", "")  # else the time of day goes into every file
+    spec.attribute("DateTime", "")  # without it the time of day goes into every file
     for name, value in attributes.items():
         if isinstance(value, np.ndarray):
             spec.attribute(name, "matrix", tuple(float(v) for v in np.asarray(value).reshape(16)))

@@ -29,7 +29,7 @@ TIMES = "warp_gi/seconds/"
 
 
 class FrameLike(Protocol):
-    """What is written of a frame; ``warp_gi.Frame`` fits."""
+    """The part of a ``Frame`` that is written to files."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -58,7 +58,7 @@ class FrameLike(Protocol):
 
     @property
     def metadata(self) -> Mapping[str, str | int | float]:
-        """What decides the pixels beside camera and time, by name."""
+        """Values by name that decide the pixels, beside camera and time."""
         ...
 
     def numpy(self, name: str) -> np.ndarray:
@@ -75,11 +75,13 @@ class FrameFile:
     formats: dict[str, str]
     """Storage format by buffer, "half" or "float"."""
     index: int
+    """Number of the frame."""
     time: float
     """Time of the frame in seconds from the first one."""
     camera: Camera | None
     """Camera of the frame; None in files by other programs."""
     metadata: dict[str, str | int | float]
+    """Values by name that decide the pixels, beside camera and time."""
     timings: dict[str, float] = field(default_factory=dict)
     """Wall seconds by stage."""
     attributes: dict[str, Attribute] = field(default_factory=dict)
@@ -196,7 +198,7 @@ def write_frame(frame: FrameLike, pattern: str | Path, precision: str = "half") 
 
 
 class HasBuffers(Protocol):
-    """What previews are made of: ``warp_gi.Frame``, or a ``FrameFile`` read back."""
+    """The part of a frame that a preview is made of: of a ``Frame``, or of a ``FrameFile`` read back."""
 
     def numpy(self, name: str) -> np.ndarray:
         """Return a buffer, [height, width] or [height, width, channels]."""

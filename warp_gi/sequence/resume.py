@@ -89,23 +89,27 @@ class Output:
 
 @dataclass(frozen=True)
 class Shot:
-    """A frame of a sequence, and where it goes."""
+    """A frame of a sequence, and its file."""
 
     index: int
+    """Number of the frame."""
     previous: int
     """Number of the frame that motion is towards."""
     path: Path
+    """File of the frame."""
     time: float
     """Time of the frame in seconds from the first one."""
     camera: Camera
+    """Camera of the frame."""
     previous_camera: Camera
+    """Camera of the frame that motion is towards."""
     lineage: str = ""
     """Hash of all that decides this frame and those before it; "" where it does not depend on them."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is left to do of a sequence."""
+    """The frames of a sequence that are left to render, and why."""
 
     shots: tuple[Shot, ...]
     """All frames that were asked for, in order."""
@@ -174,14 +178,14 @@ class SequenceRun:
         self.scheduler, self.shots, self.output = scheduler, tuple(shots), output
 
     def bake(self) -> None:
-        """Bake under the sky of the first frame, whichever of them will be rendered: resumed or not, it is the same."""
+        """Bake under the sky of the sequence's first frame, so that a resumed sequence has the same bake."""
         with self.scheduler.scene.lock:
             self.scheduler.scene.update_sky(self.shots[0].time)
             self.scheduler.bake()
 
     @cached_property
     def dependence(self) -> Dependence:
-        """How the frames depend on those before."""
+        """Dependence of the frames on those before them."""
         self.bake()
         return self.scheduler.dependence([shot.index for shot in self.shots])
 
@@ -242,7 +246,7 @@ class SequenceRun:
         return frame
 
     def save_state(self, shot: Shot, frame: Frame) -> None:
-        """Save what is known after a frame, if later ones depend on it and a file can hold it all.
+        """Save the state after a frame, if later frames depend on it and a file can hold it all.
 
         Seconds are added to the frame's timings as "save state".
         """
@@ -268,7 +272,7 @@ class SequenceRun:
         return hashlib.sha256(f"{before}{shot.camera.resolution}{attributes}".encode()).hexdigest()
 
     def _load_state(self, whole: Sequence[Shot]) -> int:
-        """Let the scheduler go on from a saved state; return after how many of the first frames, which are whole."""
+        """Let the scheduler go on from a saved state; return the number of frames that need not be rendered again."""
         path = self.output.state_path
         if not (self.dependence.is_saved and whole and path.exists()):
             return 0

@@ -1,4 +1,4 @@
-"""What a sequence knows between two frames, as plain arrays: to be saved, and to go on from in another process.
+"""The state of a sequence between two frames as plain arrays, to save and to go on from in another process.
 
 States are dataclasses and kernel structs of arrays. Only arrays are saved; all else, as sizes of the scene, comes from
 the state before the first frame, which is made anew. A state that knows better what there is to save has the methods
@@ -28,8 +28,8 @@ class Dependence:
 
     @property
     def kind(self) -> Literal["independent", "saved", "unsaved"]:
-        """How a sequence can be parted: "independent" frames are the same alone and in any order; "saved" ones go on
-        from a state file; "unsaved" ones only from the first frame."""
+        """Kind of dependence. "independent" frames are the same alone and in any order. A "saved" sequence goes on from
+        a state file, an "unsaved" one only from its first frame."""
         return "unsaved" if self.unsaved else "saved" if self.on_past else "independent"
 
     @property

@@ -31,9 +31,9 @@ from warp_gi.scene.scene import Scene
 BAY = 2.4
 HALF_X, HALF_Z = 6.0, 9.6  # axes of the arcades
 WALL_X, WALL_Z = 9.4, 13.0  # inner faces of the outer walls
-DEPTH = 0.5  # of the arcade walls
-FLOOR = 0.15  # of the lower gallery
-SPRING, CEILING = 3.25, 4.85  # of the lower arches; of the lower gallery
+DEPTH = 0.5  # thickness of the arcade walls, metres
+FLOOR = 0.15  # height of the lower gallery's floor, metres
+SPRING, CEILING = 3.25, 4.85  # heights of the lower arches' springing and of the lower gallery's ceiling, metres
 UPPER = 5.15  # floor
 UPPER_SPRING, UPPER_CEILING = 7.75, 9.2
 RAIL = 0.95  # height of the balustrade

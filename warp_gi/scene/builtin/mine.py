@@ -21,7 +21,7 @@ from warp_gi.scene.environment import SunSky, as_environment
 from warp_gi.scene.model import Material, Node
 from warp_gi.scene.scene import Scene
 
-LOW, HIGH = np.array((-25.0, -1.0, -21.0)), np.array((11.0, 12.0, 13.0))  # of the rock, metres
+LOW, HIGH = np.array((-25.0, -1.0, -21.0)), np.array((11.0, 12.0, 13.0))  # corners of the rock in metres
 CELL = 0.25
 SKY = SunSky(elevation=60.0, azimuth=300.0, turbidity=2.6, intensity=1.0)
 SPOT = np.array((4.3, 0.0, 2.4))

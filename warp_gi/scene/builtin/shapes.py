@@ -328,12 +328,6 @@ def cloth_grid(
     return np.stack([x, -height * t, folds * depth * (0.35 + 0.65 * t)], axis=-1)
 
 
-def cloth(width: float, height: float, columns: int = 32, rows: int = 24, seed: int = 0, folds: float = 0.06) -> Shape:
-    """Return ``cloth_grid`` as an open surface that faces +z, its texture upright."""
-    u, v = np.meshgrid(np.linspace(0, width, columns + 1), np.linspace(0, -height, rows + 1))
-    return loft(cloth_grid(width, height, columns, rows, seed, folds), np.stack([u, v], axis=-1), crease=180.0)
-
-
 def volume(shape: Shape) -> float:
     """Return the signed volume; positive if a closed shape's faces wind outwards."""
     a, b, c = (shape.points[shape.indices[:, k]] for k in range(3))

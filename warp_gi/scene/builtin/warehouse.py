@@ -14,7 +14,7 @@ from warp_gi.scene.model import Node
 from warp_gi.scene.scene import Scene
 
 COLUMNS, ROWS = 4, 3
-WIDTH, LENGTH, HEIGHT = 10.0, 8.0, 5.0  # of a room, metres
+WIDTH, LENGTH, HEIGHT = 10.0, 8.0, 5.0  # size of a room in metres
 WALL = 0.2
 DOOR, DOOR_HEIGHT = 2.4, 3.0
 LAMPS_X, LAMPS_Z = 8, 6  # a room

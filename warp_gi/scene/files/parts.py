@@ -1,4 +1,4 @@
-"""What a file reader hands over: the arguments of a Scene."""
+"""The result of a file reader: the arguments of a Scene."""
 
 from __future__ import annotations
 
