@@ -739,6 +739,13 @@ def test_points_beyond_the_reach_of_moments_are_lit():
     np.testing.assert_allclose(found.numpy(), [[1, 2, 3]] * len(far), rtol=0.02)  # floors of the weights
 
 
+def test_a_state_without_a_bake_bakes():
+    scene, settings = lamp_room(), gi.LightFieldProbes(**SMALL)
+    given, made = settings.start(scene, "cpu", gi.bake(scene, settings)), settings.start(scene, "cpu")
+    for name in ("positions", "radiance", "surfels", "irradiance", "moments"):
+        assert np.array_equal(getattr(given.field, name).numpy(), getattr(made.field, name).numpy()), name
+
+
 def test_emission_is_refreshed_with_the_probe():
     scene = lamp_room()
     settings = gi.LightFieldProbes(**SMALL)

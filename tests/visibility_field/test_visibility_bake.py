@@ -338,7 +338,7 @@ def test_triangles_without_area_are_skipped():
     line = replace(flat, indices=np.array([[0, 1, 2], [0, 2, 3], [0, 2, 2], [1, 1, 1]], np.int32))
     plain, with_lines = state_of(scene_of(flat)), state_of(scene_of(line))
     assert np.array_equal(plain.masks, with_lines.masks) and np.array_equal(plain.cells, with_lines.cells)
-    assert set(with_lines.baker("lasting").find().sides) == {0, 1, 2, 3}
+    assert set(with_lines.baker("static").find().sides) == {0, 1, 2, 3}
 
 
 # ---- merging ----

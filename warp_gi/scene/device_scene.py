@@ -69,7 +69,7 @@ class DeviceScene:
         masks = alpha_masks(flat, scene.materials, images, data.textures, data.texels)
         self.bvh = TriangleBvh(flat.points, flat.indices, device=device.alias, alpha=masks)
         self._masks: AlphaMasks | None = masks
-        self._resting_bvh: TriangleBvh | None = None
+        self._static_bvh: TriangleBvh | None = None
         self._light_table: wp.array | None = None
         data.bvh = self.bvh.data
         self.data = data
@@ -80,18 +80,18 @@ class DeviceScene:
             self._light_table = AliasTable.build(self.scene.emitter_powers()).on(self.device)
         return self._light_table
 
-    def resting_bvh(self) -> TriangleBvh:
+    def static_bvh(self) -> TriangleBvh:
         if not self.scene.is_animated:
             return self.bvh
-        if self._resting_bvh is None:
+        if self._static_bvh is None:
             from warp_gi.bvh import TriangleBvh
 
-            rests = ~np.isin(self.flat.objects, list(self.scene.moving_objects))
-            if not rests.any():
+            never_moves = ~np.isin(self.flat.objects, list(self.scene.moving_objects))
+            if not never_moves.any():
                 raise SceneError("everything in this scene moves; nothing can be baked")
-            masks = self._masks and replace(self._masks, face_mask=self._masks.face_mask[rests])
-            self._resting_bvh = TriangleBvh(self.flat.points, self.flat.indices[rests], self.device.alias, masks)
-        return self._resting_bvh
+            masks = self._masks and replace(self._masks, face_mask=self._masks.face_mask[never_moves])
+            self._static_bvh = TriangleBvh(self.flat.points, self.flat.indices[never_moves], self.device.alias, masks)
+        return self._static_bvh
 
     def _array(self, values: np.ndarray, dtype: type) -> wp.array:
         return on_device(values, dtype, self.device)

@@ -355,11 +355,11 @@ class Scene:
         self.data(device)
         return self._devices[_device(device).alias].bvh
 
-    def resting_bvh(self, device: str | wp.Device | None = None) -> TriangleBvh:
+    def static_bvh(self, device: str | wp.Device | None = None) -> TriangleBvh:
         """Return the TriangleBvh of the nodes that never move; it is ``bvh`` itself if nothing moves."""
         with self.lock:
             self.data(device)
-            return self._devices[_device(device).alias].resting_bvh()
+            return self._devices[_device(device).alias].static_bvh()
 
     def _all_bounds(self) -> np.ndarray:
         flat = self._flat

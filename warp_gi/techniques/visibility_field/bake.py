@@ -14,6 +14,7 @@ from warp_gi.errors import OptionError
 from warp_gi.kernels import types
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_bake as bake_kernels
+from warp_gi.kernels import visibility_field_pieces as piece_kernels
 from warp_gi.scene.geometry import surface_area
 from warp_gi.techniques.shared.octahedral import wrapped_texels
 from warp_gi.techniques.visibility_field.settings import MaskSettings
@@ -178,7 +179,7 @@ class FieldBaker:
         self._query = field_query(device, self.rays, BAKE_SETS, seed, 0 if device.is_cuda else HINTS)
         self._neighbors = neighbor_table(settings.resolution, settings.dilation)
         self._quiet = neighbor_table(settings.resolution, settings.dilation + 1)
-        search = bake_kernels.PieceSearch()
+        search = piece_kernels.PieceSearch()
         search.low, search.cell_size = wp.vec3(*grid.low), grid.cell_size
         search.nx, search.ny, search.nz = grid.shape
         search.radius, search.spacing = radius, EDGE_SPACINGS / math.sqrt(self.density)
@@ -209,7 +210,7 @@ class FieldBaker:
         sides = 2 * len(self.geometry.indices)
         counts = wp.zeros(sides, dtype=wp.int32, device=device)
         outputs = [wp.empty(0, dtype=dtype, device=device) for dtype in (wp.int32, wp.float32, wp.int32)]
-        launch.launch(bake_kernels.find_pieces, sides, [self.geometry, search, counts, *outputs], device)
+        launch.launch(piece_kernels.find_pieces, sides, [self.geometry, search, counts, *outputs], device)
         count = counts.numpy()
         starts = np.cumsum(count, dtype=np.int64) - count
         total = int(count.sum(dtype=np.int64))
@@ -217,7 +218,7 @@ class FieldBaker:
             raise OptionError(f"{total:,} pieces of surfaces in cells are too many; use larger cells")
         search.start = wp.array(starts, dtype=wp.int64, device=device)
         outputs = [wp.empty(total, dtype=dtype, device=device) for dtype in (wp.int32, wp.float32, wp.int32)]
-        launch.launch(bake_kernels.find_pieces, sides, [self.geometry, search, counts, *outputs], device)
+        launch.launch(piece_kernels.find_pieces, sides, [self.geometry, search, counts, *outputs], device)
         found, areas, edge_counts = (array.numpy() for array in outputs)
         side = np.repeat(np.arange(sides, dtype=np.int32), count)
         kept = np.flatnonzero(areas > 0.0)

@@ -216,7 +216,7 @@ class FieldState:
         if layer not in self._bakers:
             data = self.scene.data(self.device)
             if layer == "static":
-                bvh = self.scene.resting_bvh(self.device).data
+                bvh = self.scene.static_bvh(self.device).data
                 left_out = np.zeros(len(self.scene.object_names), np.int32)
                 left_out[list(self.movers)] = 1
             else:
