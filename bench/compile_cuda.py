@@ -20,11 +20,13 @@ from warp_gi import launch, registry
 from warp_gi.kernels.path_samplers import (
     ALIAS_LIGHTS,
     BSDF_DIRECTIONS,
+    NO_CACHE,
     NO_REGIONS,
     SCENE_SKY,
     DirectionSampler,
     LightSampler,
     PathCache,
+    Sky,
 )
 from warp_gi.kernels.path_trace import PathTracer, path_tracer
 from warp_gi.kernels.samples import SAMPLE_REGIONS
@@ -40,7 +42,7 @@ def kernel_modules() -> list[str]:
 
 
 def every_tracer() -> list[PathTracer]:
-    """Return the path tracers of the registry: each light sampler with each direction sampler, and each cache once."""
+    """Return the path tracers of the registry: each light sampler with each direction sampler, and each hook once."""
     found = registry.samplers().values()
     lights = [one for one in found if isinstance(one, LightSampler)]
     directions = [one for one in found if isinstance(one, DirectionSampler)]
@@ -49,8 +51,9 @@ def every_tracer() -> list[PathTracer]:
         SAMPLE_REGIONS if light.uses_regions or direction.uses_regions else NO_REGIONS for light, direction in pairs
     ]
     plain = [path_tracer(*pair, region) for pair, region in zip(pairs, regions, strict=True)]
-    caches = [one for one in found if isinstance(one, PathCache)]
-    return plain + [path_tracer(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY, cache) for cache in caches]
+    hooks = [(SCENE_SKY, one) for one in found if isinstance(one, PathCache)]
+    hooks += [(one, NO_CACHE) for one in found if isinstance(one, Sky)]
+    return plain + [path_tracer(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, sky, cache) for sky, cache in hooks]
 
 
 def compile_module(name: str, architectures: Sequence[int], folder: Path) -> list[Path]:

@@ -134,7 +134,8 @@ def path_tracer(
 
 def _module_name(lights: LightSampler, directions: DirectionSampler, sky: Sky, cache: PathCache) -> str:
     """Return the name of a tracer's Warp module: by its samplers, and the hooks that are in use."""
-    hooks = [hook.name for hook, unused in ((sky, SCENE_SKY), (cache, NO_CACHE)) if hook is not unused]
+    hooks = [f"sky_{sky.name}"] if sky is not SCENE_SKY else []
+    hooks += [f"cache_{cache.name}"] if cache is not NO_CACHE else []
     return "_".join([f"{__name__}.{lights.name}", directions.name, *hooks])
 
 

@@ -71,6 +71,9 @@ FIELD_LIGHT_DIMENSION = wp.constant(102)  # which light samples are verified (ra
 FIELD_LOBE_DIMENSION = wp.constant(103)  # which lobe of a glossy surface (random)
 FIELD_SET_DIMENSION = wp.constant(104)  # which set of light samples a pixel takes (random)
 
+# Launches of techniques that have no lines here: from this dimension on, up to 999 of them.
+OWN_DIMENSION = wp.constant(3000)
+
 # ---- numbers ----
 
 _INTEGER_CODE = """

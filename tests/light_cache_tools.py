@@ -224,12 +224,10 @@ def preprocessed(scene, estimator=None, state=None, time=0.0, position=(0.0, 1.0
         device=device(),
         data=data,
         camera=SimpleNamespace(position=position),
-        paths=PathRequest(),
+        paths=PathRequest(data.emitters),
         launch=lambda kernel, inputs, count: launch(kernel, count, inputs, device()),
     )
     state = estimator.preprocess(frame, state)
-    if frame.paths.table is not None:
-        data.emitters.alias = frame.paths.table  # as the path tracer's launch does
     return frame, state
 
 

@@ -1,6 +1,7 @@
 """What ``warp_gi/__init__.py`` loads on first use, for type checkers and editors, which cannot follow that.
 
 One line a name. A test compares them with ``warp_gi.__all__``.
+A technique may lack its line: it works, and only checkers do not see it.
 """
 
 from warp_gi import metrics as metrics
@@ -20,6 +21,8 @@ from warp_gi.estimator import Estimator as Estimator
 from warp_gi.frame import Frame as Frame
 from warp_gi.launch import set_threads as set_threads
 from warp_gi.pipeline import Pipeline as Pipeline
+from warp_gi.primary import Primary as Primary
+from warp_gi.radiance_cache import RadianceCache as RadianceCache
 from warp_gi.rendering import bake as bake
 from warp_gi.rendering import plan_sequence as plan_sequence
 from warp_gi.rendering import render as render
@@ -43,6 +46,7 @@ from warp_gi.scheduler import FrameScheduler as FrameScheduler
 from warp_gi.sequence.frames import read_frame as read_frame
 from warp_gi.sequence.frames import write_frame as write_frame
 from warp_gi.sequence.resume import Plan as Plan
+from warp_gi.stateful import Service as Service
 from warp_gi.techniques.light_field.estimator import LightFieldProbes as LightFieldProbes
 from warp_gi.techniques.light_hierarchy.estimator import LightHierarchy as LightHierarchy
 from warp_gi.techniques.paths.estimators import BsdfPaths as BsdfPaths

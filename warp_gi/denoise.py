@@ -59,8 +59,8 @@ class History:
     """Number of the frame."""
     resolution: tuple[int, int]
     """Width and height of the frame in pixels."""
-    scene: tuple[Scene | BakedScene, int]
-    """Scene and its version: another sky or animation is another light."""
+    scene: tuple[Scene | BakedScene, str]
+    """Scene and its hash: another sky or animation is another light."""
     guides: denoise.Guides
     """Geometry and colours of the surfaces in the frame's pixels."""
     average: denoise.Signals
@@ -72,7 +72,7 @@ class History:
             frame.previous_index == self.index != frame.index
             and frame.camera.resolution == self.resolution
             and frame.scene is self.scene[0]
-            and frame.scene.version == self.scene[1]
+            and frame.scene.hash == self.scene[1]
         )
 
 
@@ -145,8 +145,8 @@ class SpatioTemporal(Denoiser):
         else:
             average = signals
         frame.launch(denoise.put_back, [light, guides, self._blurred(frame, guides, average), frame["beauty"]])
-        version = (frame.scene, frame.scene.version)
-        return History(frame.index, frame.camera.resolution, version, guides, average)
+        scene = (frame.scene, frame.scene.hash)
+        return History(frame.index, frame.camera.resolution, scene, guides, average)
 
     def _blurred(self, frame: Frame, guides: denoise.Guides, source: denoise.Signals) -> denoise.Signals:
         """Return signals filtered over pixels."""

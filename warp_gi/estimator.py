@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from warp_gi.frame import Frame
     from warp_gi.primary import Primary
     from warp_gi.radiance_cache import RadianceCache
-    from warp_gi.service import Service
 
 __all__ = ["Ahead", "Estimator"]
 
@@ -31,14 +30,6 @@ class Estimator(Stateful):
     def trace(self, frame: Frame, state: Any) -> None:
         """Add this term's samples of the current camera sample to the frame's buffers."""
         raise NotImplementedError
-
-    @property
-    def services(self) -> tuple[Service, ...]:
-        """Services that the estimator needs in every frame.
-
-        A field of the pipeline with a service's name replaces its settings.
-        """
-        return ()
 
     @property
     def radiance_cache(self) -> RadianceCache | None:

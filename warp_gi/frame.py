@@ -14,9 +14,9 @@ import warp as wp
 
 from warp_gi import launch
 from warp_gi.errors import unknown_name
-from warp_gi.kernels import denoise, gbuffer, path_samplers, path_trace, types
+from warp_gi.kernels import denoise, gbuffer, path_trace, types
 from warp_gi.paths import PathRequest, sky_probability
-from warp_gi.scene.baked import BakedScene, whole_scene
+from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.pinhole import camera_data
 
@@ -89,7 +89,7 @@ class Frame:
         """Wall seconds by stage; "compile" is kernel compilation, left out of the others."""
         self.metadata: dict[str, str | int | float] = {}
         """Values by name that decide the pixels, beside camera and time."""
-        self.paths = PathRequest()
+        self.paths = PathRequest(data.emitters)
         """Requests of estimators to the path tracer."""
         self.sky_probability = sky_probability(scene)
         """Probability of sampling the sky where a path vertex samples either the sky or an emitter."""
@@ -226,10 +226,6 @@ class Frame:
         settings.roulette_depth, settings.clamp = request.roulette_depth, request.clamp
         settings.sky_probability, settings.spp = self.sky_probability, self.settings.spp
         settings.cache_vertex = request.cache_vertex
-        if request.table is not None:
-            self.data.emitters.alias = request.table
-        elif self.scene.emitter_count and request.lights.sampler is path_samplers.ALIAS_LIGHTS:
-            self.data.emitters.alias = whole_scene(self.scene).light_table(self.device)
         tracer = path_trace.path_tracer(*request.samplers())
         samplers = tracer.samplers()
         for name in tracer.samplers.vars:

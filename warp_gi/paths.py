@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 import warp as wp
 
 from warp_gi.color import LUMINANCE
-from warp_gi.kernels import path_samplers, path_trace
+from warp_gi.errors import OptionError
+from warp_gi.kernels import path_samplers, path_trace, types
 from warp_gi.scene.baked import BakedScene
 
 if TYPE_CHECKING:
@@ -43,7 +44,8 @@ class PathRequest:
     in proportion to their power, and directions by the BSDF.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, emitters: types.Emitters) -> None:
+        self._emitters = emitters
         self.lights = SamplerInUse(path_samplers.ALIAS_LIGHTS, path_samplers.AliasLights())
         self.directions = SamplerInUse(path_samplers.BSDF_DIRECTIONS, path_samplers.BsdfDirections())
         self.regions = SamplerInUse(path_samplers.NO_REGIONS, path_samplers.NoRegions())
@@ -54,8 +56,6 @@ class PathRequest:
         """Radiance cache that paths may end in."""
         self.cache_vertex = int(path_trace.CACHE_VERTEX)
         """First vertex at which paths may end in the radiance cache; 1 is the first hit."""
-        self.table: wp.array | None = None
-        """Alias table over emitters, AliasBucket [emitter]; None is that of the scene, by power."""
         self.terms = 0
         """Bits of the terms that this camera sample's estimators want, ``path_trace.TERM_*``."""
         self.max_depth = 2
@@ -64,6 +64,7 @@ class PathRequest:
         """Number of edges from which on paths end at random."""
         self.clamp = 0.0
         """Largest component of a path's indirect radiance, W/(m^2 sr); 0 is no limit."""
+        self._asked: set[str] = set()
         self._regions: tuple[path_samplers.Regions, Callable[[PathRequest], Any]] | None = None
 
     # ---- requests ----
@@ -71,13 +72,21 @@ class PathRequest:
     def use_lights(self, sampler: path_samplers.LightSampler, data: Any, table: wp.array | None = None) -> None:
         """Let vertices sample lights by ``sampler``.
 
-        ``data`` is its struct. ``table`` is an alias table over the emitters, for samplers that draw from one.
+        ``data`` is its struct. ``table`` is an alias table over the emitters, AliasBucket [emitter], for samplers that
+        draw from one; None leaves the scene's, by power. Asked in ``preprocess``. Raises OptionError if another sampler
+        was asked for in this frame.
         """
+        self._ask("lights", self.lights, sampler)
         self.lights = SamplerInUse(sampler, data)
-        self.table = table
+        if table is not None:
+            self._emitters.alias = table
 
     def use_directions(self, sampler: path_samplers.DirectionSampler, data: Any) -> None:
-        """Let paths go on in directions of ``sampler``; ``data`` is its struct."""
+        """Let paths go on in directions of ``sampler``; ``data`` is its struct.
+
+        Asked in ``preprocess``. Raises OptionError if another sampler was asked for in this frame.
+        """
+        self._ask("directions", self.directions, sampler)
         self.directions = SamplerInUse(sampler, data)
 
     def use_regions(self, regions: path_samplers.Regions, data: Callable[[PathRequest], Any]) -> None:
@@ -87,6 +96,14 @@ class PathRequest:
         regions, when all else is known.
         """
         self._regions = regions, data
+
+    def _ask(self, what: str, known: SamplerInUse[Any], sampler: Any) -> None:
+        if what in self._asked and known.sampler is not sampler:
+            raise OptionError(
+                f"two estimators sample {what} of paths, by {known.sampler.name!r} and by {sampler.name!r}: leave one "
+                "of them out"
+            )
+        self._asked.add(what)
 
     def use_sky(self, sky: path_samplers.Sky, data: Any) -> None:
         """Let paths that leave the scene meet ``sky`` in place of the scene's; ``data`` is its struct."""
@@ -136,9 +153,16 @@ class PathRequest:
     def prepare(self) -> None:
         """Make the regions, once a frame, if a sampler uses them."""
         uses_regions = self.lights.sampler.uses_regions or self.directions.sampler.uses_regions
-        if uses_regions and self._regions is not None:
-            regions, data = self._regions
-            self.regions, self._regions = SamplerInUse(regions, data(self)), None
+        if not uses_regions or self.regions.sampler is not path_samplers.NO_REGIONS:
+            return
+        if self._regions is None:
+            names = f"{self.lights.sampler.name!r} and {self.directions.sampler.name!r}"
+            raise OptionError(
+                f"the samplers {names} tell regions apart, and no service offers any: return SampleOctree() among the "
+                "services of the estimator"
+            )
+        regions, data = self._regions
+        self.regions = SamplerInUse(regions, data(self))
 
 
 def sky_probability(scene: Scene | BakedScene) -> float:

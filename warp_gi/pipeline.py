@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from numbers import Integral
 from typing import Any
 
 from warp_gi import registry
 from warp_gi.baking import Bake
-from warp_gi.denoise import Denoiser, denoiser_named
+from warp_gi.denoise import DENOISERS, Denoiser, denoiser_named
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.frame import TERMS, FrameSettings
@@ -18,8 +18,7 @@ from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.scene import Scene
 from warp_gi.sequence.state import Dependence
-from warp_gi.service import Service
-from warp_gi.stateful import Ahead, Stateful
+from warp_gi.stateful import Ahead, Service, Stateful
 
 FILTERS = ("box", "tent")
 MOST_SAMPLES = 1 << 24  # a pixel; random numbers count samples and pixels together in 32 bits
@@ -102,19 +101,31 @@ class Pipeline:
                 yield term, estimator
 
     def services(self) -> dict[str, Service]:
-        """Return the services that estimators ask for, by name.
+        """Return the services that estimators and radiance caches ask for, by name; those that they ask for come first.
 
-        Raises OptionError where two estimators ask for one with different settings, and no field here has its name.
+        Raises OptionError where two ask for one with different settings, and no field here has its name.
         """
         found: dict[str, Service] = {}
-        for term, estimator in self.estimators():
-            for service in estimator.services:
-                service = getattr(self, service.name, service)
+
+        def gather(place: str, part: Stateful) -> None:
+            for service in part.services:
+                service = self._settings_of(service)
+                gather(service.name, service)
                 if found.setdefault(service.name, service) != service:
                     raise OptionError(
-                        f"{term} asks for the service {service.name!r} with other settings than others do"
+                        f"{place} asks for the service {service.name!r} with other settings than others do"
                     )
+
+        for place, part in (*self.radiance_caches(), *self.estimators()):
+            gather(place, part)
         return found
+
+    def _settings_of(self, service: Service) -> Service:
+        """Return a service, with the settings that a field of its name has."""
+        own = getattr(self, service.name) if service.name in {one.name for one in fields(self)} else service
+        if not isinstance(own, Service):
+            raise OptionError(f"a service cannot be named {service.name!r}: that is another setting of a pipeline")
+        return own
 
     def radiance_caches(self) -> Iterator[tuple[str, RadianceCache]]:
         """Yield (place, cache) of the radiance caches in which paths end, for example ("indirect.ends_in", ...)."""
@@ -124,10 +135,11 @@ class Pipeline:
 
     def primary(self) -> tuple[str, Primary]:
         """Return what finds the frame's primary hits, and whose state it reads: a term, or "" for none."""
-        for term, estimator in self.estimators():
-            if estimator.own_primary is not None:
-                return term, estimator.own_primary
-        return "", CameraRays()
+        found = [(term, one.own_primary) for term, one in self.estimators() if one.own_primary is not None]
+        if len(found) > 1:
+            terms = " and ".join(term for term, _ in found)
+            raise OptionError(f"the estimators of {terms} find primary hits; leave all but one of them out")
+        return found[0] if found else ("", CameraRays())
 
     def parts(self) -> dict[str, Stateful]:
         """Return all that keeps a state over frames, by its place, in the order in which frames ask them."""
@@ -137,21 +149,19 @@ class Pipeline:
     def dependence(self, scene: Scene | BakedScene, ahead: Callable[[str], Ahead] | None = None) -> Dependence:
         """Return how frames of a scene depend on those before: not, on a state that can be saved, or on others.
 
-        ``ahead`` returns what is known of the frames to come for the part in a place; None asks for every camera, sky
-        and state that there may be.
+        ``ahead`` returns what is known of the frames to come for the part in a place. None is what the scene says:
+        whether it moves, and whether its sky does. A scheduler, which has states, may know that more is independent.
         """
-        depends = {
-            place: part
-            for place, part in self.parts().items()
-            if part.depends_on_past(scene, None if ahead is None else ahead(place))
-        }
-        for term, estimator in self.estimators():
-            for service in estimator.services if term in depends else ():
-                depends.pop(service.name, None)  # its state is of use to the estimator alone, which is named
-        if DENOISER in depends:
-            depends["denoiser"] = depends.pop(DENOISER)
-        unsaved = [place for place, part in depends.items() if not part.saves_state]
-        return Dependence(tuple(depends), tuple(unsaved))
+        known = ahead or (lambda place: Ahead(None, (), scene.is_sky_animated))
+        depends = {place: part for place, part in self.parts().items() if part.depends_on_past(scene, known(place))}
+        unsaved = {place for place, part in depends.items() if not part.saves_state}
+        shown = dict(depends)
+        for place in depends:  # a service whose state can be saved is of use to those who ask, who are named
+            for service in depends[place].services:
+                if service.name in depends and service.name not in unsaved:
+                    shown.pop(service.name, None)
+        names = {place: "denoiser" if place == DENOISER else place for place in shown}
+        return Dependence(tuple(names.values()), tuple(name for place, name in names.items() if place in unsaved))
 
     def fitting(self, bake: Bake) -> Pipeline:
         """Return the pipeline with its settings as those of a bake that is rendered without its scene.
@@ -207,30 +217,37 @@ class Pipeline:
         for setting in settings:
             if setting not in names:
                 raise unknown_name("pipeline setting", setting, names)
-        made = {key: _estimator_of(value) for key, value in known[name].items() if key not in settings}
-        return cls(**made, **settings)
+        fresh = {key: made(value) for key, value in known[name].items() if key not in settings}
+        return cls(**fresh, **settings)
+
+
+def made(value: Any) -> Any:
+    """Return what a value of the registry stands for.
+
+    The name of a technique's class, or of a denoiser's, is that class with its defaults; a pair of the name and
+    settings is the class with these, whose values may be names and pairs again. Any other value is itself.
+    """
+    name, settings = value if isinstance(value, tuple) and len(value) == 2 else (value, {})
+    kinds = {kind.__name__: kind for kind in DENOISERS.values()}
+    if not isinstance(name, str) or not isinstance(settings, Mapping):
+        return value
+    kind = kinds.get(name) or (registry.find(name) if name in registry.public() else None)
+    if not isinstance(kind, type):
+        return value
+    return kind(**{key: made(setting) for key, setting in settings.items()})
 
 
 def estimator_named(term: str, name: str) -> Estimator:
-    """Return the estimator of a class name with its defaults.
+    """Return the estimator of a class name with its defaults, for a term.
 
     Raises OptionError if there is none, with the names of those of the term.
     """
     classes = {known: registry.find(known) for one in registry.techniques().values() for known in one.estimators}
     if name not in classes:
-        of_term = [known for known, kind in classes.items() if kind.term == term]
+        of_term = [known for known, kind in classes.items() if getattr(kind, "term", term) == term]
         raise unknown_name(f"{term} estimator", name, of_term)
-    return classes[name]()
-
-
-def _estimator_of(value: Any) -> Any:
-    """Return what a preset's value stands for: a class name, a pair of that and its settings, or the value itself."""
-    if isinstance(value, str):
-        return registry.find(value)()
-    if isinstance(value, tuple):
-        name, settings = value
-        return registry.find(name)(**settings)
-    return value
+    takes_term = any(one.name == "term" for one in fields(classes[name]))  # one that serves several
+    return classes[name](term=term) if takes_term else classes[name]()
 
 
 def _is_whole(estimator: Estimator) -> bool:

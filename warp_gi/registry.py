@@ -52,15 +52,17 @@ class Technique:
     """Estimators by class name."""
     services: Mapping[str, Entry] = field(default_factory=dict)
     """Services by class name."""
+    caches: Mapping[str, Entry] = field(default_factory=dict)
+    """Radiance caches by class name, beside estimators that are caches, too."""
     functions: Mapping[str, str] = field(default_factory=dict)
     """Public functions by name, with the module below the folder that defines them."""
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Pipelines by name: fields where they differ from the default pipeline's.
 
-    The value of a term is the name of an estimator, a pair of that and its settings, or None.
+    A value is the name of a class, a pair of that and its settings, or what it is: ``pipeline.made``.
     """
     samplers: tuple[str, ...] = ()
-    """Light samplers, direction samplers and radiance caches of path tracers: "module.NAME" below warp_gi.kernels."""
+    """Light samplers, direction samplers, skies and caches of path tracers: "module.NAME" below warp_gi.kernels."""
     bake_tool: str = ""
     """Module below the folder with ``TOOL``, by which ``warp-gi bake`` bakes it; "" if it has none."""
     suite: str = ""
@@ -110,7 +112,7 @@ def public() -> dict[str, str]:
     """Return the modules of all classes and functions of techniques that users see, by name."""
     found = {}
     for one in techniques().values():
-        for name, entry in {**one.estimators, **one.services}.items():
+        for name, entry in {**one.estimators, **one.services, **one.caches}.items():
             found[name] = f"{folder_of(one)}.{entry.module}"
         found |= {name: f"{folder_of(one)}.{module}" for name, module in one.functions.items()}
     return found
@@ -129,7 +131,7 @@ def claims() -> Iterator[tuple[str, str, Claim]]:
 
 
 def samplers() -> dict[str, Any]:
-    """Return light samplers, direction samplers and radiance caches of every technique, by "module.NAME"."""
+    """Return light samplers, direction samplers, skies and radiance caches of every technique, by "module.NAME"."""
     found = {}
     for one in techniques().values():
         for path in one.samplers:

@@ -7,14 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from warp_gi.errors import OptionError
+from warp_gi.estimator import Estimator
 from warp_gi.pipeline import Pipeline
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence.resume import Output, Plan, SequenceRun, shots_of
+from warp_gi.stateful import Stateful
 
 if TYPE_CHECKING:
     from warp_gi.baking import Bake
-    from warp_gi.estimator import Estimator
     from warp_gi.frame import Frame
     from warp_gi.scene.scene import Scene
 
@@ -120,7 +121,7 @@ def plan_sequence(
 
 def bake(
     scene: Scene,
-    estimator: Estimator,
+    estimator: Stateful,
     device: str = "cpu",
     seed: int = 0,
     camera: Camera | CameraPath | None = None,
@@ -132,7 +133,7 @@ def bake(
 
     Args:
         scene: What will be rendered. It is baked as it is at time 0, its sky too.
-        estimator: For example ``gi.VisibilityField(cell_size=0.5)``.
+        estimator: An estimator or a radiance cache, for example ``gi.VisibilityField(cell_size=0.5)``.
         device: "cpu", "cuda", "cuda:1".
         seed: Every random number follows from it.
         camera: Where the scene will be seen from, for estimators that bake no more than that; None is everywhere.
@@ -151,6 +152,10 @@ def bake(
         scene.update_sky(0.0)
         scene.update(0.0, None, device)
         result = estimator.bake(scene, device, seed, told, camera)
+    if result is None and isinstance(estimator, Estimator) and estimator.radiance_cache is not None:
+        raise OptionError(
+            f"{type(estimator).__name__} has nothing to bake, but the cache has that its paths end in: bake its ends_in"
+        )
     if result is None:
         raise OptionError(
             f"{type(estimator).__name__} with these settings has nothing to bake; render with it as it is"

@@ -16,9 +16,11 @@ from warp_gi import launch
 from warp_gi.baking import Bake, Setting, load_bake
 from warp_gi.denoise import Denoiser
 from warp_gi.errors import BakeError, OptionError, unknown_name
+from warp_gi.estimator import Estimator
 from warp_gi.frame import Frame
 from warp_gi.kernels import compose, types
 from warp_gi.pipeline import DENOISER, Pipeline
+from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.camera import Camera, CameraPath, frame_time
 from warp_gi.scene.scene import Scene
@@ -92,23 +94,28 @@ class FrameScheduler:
         self._parts = self.pipeline.parts()
         self._bakes = _bakes_by_class(bakes, self._parts)
         self._bake_digests: dict[str, str] = {}
+        self._made: dict[tuple[str, str, str], Bake] = {}
         self._states: dict[str, Any] = {}
         self._keys: dict[str, str] = {}
         if self.pipeline.denoise is not None:  # first of all: it says if it is not installed
             self._start_part(DENOISER, self.pipeline.denoise)
         self._bake_seconds = 0.0
         self._baked_version = -1
+        self._sky_time = 0.0
         self._scene_hash = ""
 
     # ---- before the first frame ----
 
     @_holds_scene
-    def bake(self) -> None:
+    def bake(self, sky_time: float | None = None) -> None:
         """Let every part compute what it can before the first frame; done by the first frame otherwise.
 
-        Done afresh when the scene got another environment or animation, for every part that depends on it:
-        the others keep their states.
+        Done afresh when the scene got another environment or animation, for every part that depends on it: the others
+        keep their states. ``sky_time`` is the time in seconds of a sky that is a function of time: that of the first
+        frame. None is that of the last frame, or 0 before any.
         """
+        self._sky_time = self._sky_time if sky_time is None else sky_time
+        self.scene.update_sky(self._sky_time)  # whoever rendered another time of the scene since
         if self._baked_version == self.scene.version:
             return
         started = time.perf_counter()
@@ -122,8 +129,8 @@ class FrameScheduler:
 
     def _start_part(self, place: str, part: Stateful) -> None:
         """Start a part, unless all that it depends on is what it was."""
-        key = part.bake_key(self.scene)
-        if not key or self._keys.get(place) != key:
+        key = part.bake_key(self.scene) or self.scene.hash
+        if self._keys.get(place) != key:
             self._states[place], self._keys[place] = self._start(place, part), key
 
     def _start(self, place: str, part: Stateful) -> Any:
@@ -132,7 +139,11 @@ class FrameScheduler:
         if bake is None and place != DENOISER:
             self._progress(f"bake {place}", 0.0)
             told = lambda share: self._progress(f"bake {place}", share)  # noqa: E731
-            bake = part.bake(whole_scene(self.scene), device, self.seed, told, self.camera)
+            bake = self._made.get(self._bake_id(part)) or part.bake(
+                whole_scene(self.scene), device, self.seed, told, self.camera
+            )
+            if bake is not None and sum(type(one) is type(part) for one in self._parts.values()) > 1:
+                self._made[self._bake_id(part)] = bake  # for the other places of its class
         elif bake is not None and not isinstance(self.scene, BakedScene):
             settings = part.bake_settings(self.scene)
             bake.check(type(part).__name__, part.bake_key(self.scene), settings, self.scene.name)
@@ -141,13 +152,18 @@ class FrameScheduler:
             self._bake_digests[f"bake.{place}"] = bake.digest[:16]
         return part.start(self.scene, device, bake, self.seed)
 
+    def _bake_id(self, part: Stateful) -> tuple[str, str, str]:
+        """Return what decides a part's bake: equal ones have the same."""
+        settings = sorted(part.bake_settings(self.scene).items())
+        return type(part).__name__, part.bake_key(self.scene) or self.scene.hash, repr(settings)
+
     def _bake_for(self, part: Stateful) -> Bake | None:
         """Return the bake that was given for a part, or None.
 
         Of several for its class it is one with the part's settings. A bake that fits another part of the class is not
         for this one. One that fits none is returned, for ``Bake.check`` to say why.
         """
-        given = self._bakes[type(part).__name__]
+        given = self._bakes.get(type(part).__name__, [])
         mine = [bake for bake in given if bake.has(part.bake_settings(self.scene))] or given
         others = [one.bake_settings(self.scene) for one in self._parts.values() if type(one) is type(part)]
         if mine is given and any(bake.has(settings) for bake in given for settings in others):
@@ -173,16 +189,14 @@ class FrameScheduler:
         A frame that an exception interrupts leaves nothing behind: what is rendered next is as if it had not begun.
         """
         self.scene.check_unchanged()
-        self.scene.update_sky(frame_time(self.camera, index))
-        self.bake()
+        self.bake(frame_time(self.camera, index))
         if previous_index is None:
             previous_index = max(index - 1, 0)
         frame = self._new_frame(index, previous_index)
         states = dict(self._states)
         for place, part in self._parts.items():
-            if place != DENOISER:
-                with frame.stage(f"preprocess {place}"):
-                    states[place] = part.preprocess(frame, states[place])
+            with frame.stage(f"preprocess {place}"):
+                states[place] = part.preprocess(frame, states[place])
         views = frame.settings.camera_samples
         for view in range(views):
             self._trace_view(frame, view, states)
@@ -190,7 +204,7 @@ class FrameScheduler:
         with frame.stage("compose"):
             frame.launch(compose.compose_frame, [views, frame.settings.spp, frame.struct(compose.FrameSums)])
         for place, part in self._parts.items():
-            if part.learns and place != DENOISER:
+            if part.learns:
                 with frame.stage(f"learn {place}"):
                     states[place] = part.after(frame, states[place])
         denoiser = self._parts.get(DENOISER)
@@ -207,6 +221,8 @@ class FrameScheduler:
         self.scene.update(index / fps, previous_index / fps, self.device)
         data = launch.copied(self.scene.data(self.device), types.SceneData)
         data.emitters = launch.copied(data.emitters, types.Emitters)
+        if not isinstance(self.scene, BakedScene) and self.scene.emitter_count:
+            data.emitters.alias = whole_scene(self.scene).light_table(self.device)
         cameras = self._camera_at(index), self._camera_at(previous_index)
         settings, seed = self.pipeline.frame_settings, _mix(self.seed, index)
         frame = Frame(self.scene, data, *cameras, settings, self.device, index, index / fps, seed, previous_index)
@@ -235,9 +251,12 @@ class FrameScheduler:
     def _camera_at(self, index: int) -> Camera:
         return self.camera.camera(index) if isinstance(self.camera, CameraPath) else self.camera
 
-    def metadata(self) -> dict[str, str | int | float]:
-        """Return what decides the pixels beside camera and time; a resumed run checks files against it."""
-        self.bake()
+    def metadata(self, sky_time: float | None = None) -> dict[str, str | int | float]:
+        """Return what decides the pixels beside camera and time; a resumed run checks files against it.
+
+        ``sky_time`` is the time in seconds of a sky that is a function of time; None is that of the last frame.
+        """
+        self.bake(sky_time)
         return {
             "seed": self.seed,
             "scene": self.scene.name,
@@ -298,7 +317,8 @@ class FrameScheduler:
 
 def _bakes_by_class(bakes: Iterable[Bake], parts: dict[str, Stateful]) -> dict[str, list[Bake]]:
     """Return the bakes by the class that they are for; raises BakeError for one that nothing uses."""
-    found: dict[str, list[Bake]] = {type(part).__name__: [] for part in parts.values()}
+    users = [part for part in parts.values() if isinstance(part, Estimator | RadianceCache)]
+    found: dict[str, list[Bake]] = {type(part).__name__: [] for part in users}
     for one in bakes:
         if one.technique not in found:
             names = ", ".join(sorted(found)) or "none"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 if TYPE_CHECKING:
     from warp_gi.baking import Bake, Setting
@@ -19,11 +19,19 @@ class Ahead:
     """Knowledge of a sequence before its first frame."""
 
     state: Any
-    """State before the first frame, of the part that the question is about."""
+    """State before the first frame of whom the question is asked; None where it is not known."""
     views: Sequence[tuple[int, Camera]]
     """Number and camera of each frame that will be rendered."""
     sky_changes: bool = False
     """Whether the scene gets another sky from frame to frame."""
+
+
+_EARLIER = {
+    "learn": "learn in after(frame, state), from frame.offered(Lesson) of the service SampleOctree",
+    "makes_primary": "return a Primary as own_primary",
+    "trace_primary": "return a Primary as own_primary, and trace there",
+}
+"""Methods of estimators before 0.1.0, and what takes their place."""
 
 
 @dataclass(frozen=True)
@@ -36,16 +44,32 @@ class Stateful:
     interrupted is rendered again from there. Nothing is kept anywhere but in the state.
     """
 
+    def __init_subclass__(cls, **more: Any) -> None:
+        """Refuse methods of an earlier protocol, which nobody would call."""
+        super().__init_subclass__(**more)
+        for name, instead in _EARLIER.items():
+            if name in vars(cls) and "after" not in vars(cls):
+                if name != "learn" or cls.after is Stateful.after:
+                    raise TypeError(f"{cls.__name__}.{name} is of an earlier version and never called: {instead}")
+
     def __post_init__(self) -> None:
         self.validate()
 
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
 
+    @property
+    def services(self) -> tuple[Service, ...]:
+        """Services that this needs in every frame.
+
+        A field of the pipeline that holds a service of the same name replaces its settings.
+        """
+        return ()
+
     # ---- before the first frame ----
 
     def bake_key(self, scene: Scene | BakedScene) -> str:
-        """Return a hash of all in the scene that ``bake`` and ``start`` depend on; "" stands for everything.
+        """Return a hash of all in the scene that ``bake`` and ``start`` depend on; "" stands for ``scene.hash``.
 
         While the hash stays the same, a changed sky or light leaves bake and state as they are.
         """
@@ -108,3 +132,15 @@ class Stateful:
     def learns(self) -> bool:
         """Whether ``after`` does anything."""
         return type(self).after is not Stateful.after
+
+
+@dataclass(frozen=True)
+class Service(Stateful):
+    """Base of every service: several estimators share it, and it is built once a frame before they preprocess.
+
+    An estimator names the services that it needs (``Stateful.services``). ``preprocess`` and ``after`` run before
+    those of estimators, and hand over what they made by ``Frame.offer``; estimators take it by ``Frame.offered``.
+    """
+
+    name: ClassVar[str]
+    """Key of the service's state. A field of ``Pipeline`` with this name holds its settings."""

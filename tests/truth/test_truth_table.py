@@ -11,6 +11,7 @@ from truth_tools import CASES, Case, cube_light, lit_by, quarter_form_factor, sk
 
 import warp_gi as gi
 from warp_gi import registry
+from warp_gi.pipeline import made
 
 LEARNING, FRAMES = 4, 12
 """Frames that estimators may learn in, and those that count."""
@@ -24,7 +25,7 @@ def known(estimator: gi.Estimator) -> dict[str, Case]:
 
 def estimator_of(label: str, **settings: object) -> gi.Estimator:
     name, claim = CLAIMS[label]
-    return registry.find(name)(**{**claim.settings, **settings})
+    return made((name, {**claim.settings, **settings}))
 
 
 def pictures(case: Case, estimator: gi.Estimator) -> dict[str, np.ndarray]:

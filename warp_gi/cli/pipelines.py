@@ -48,7 +48,8 @@ def _ending(pipeline: Pipeline, term: str, name: str) -> Pipeline:
 
 
 def _cache_named(name: str) -> RadianceCache:
-    classes = {known: registry.find(known) for one in registry.techniques().values() for known in one.estimators}
+    names = [known for one in registry.techniques().values() for known in (*one.estimators, *one.caches)]
+    classes = {known: registry.find(known) for known in names}
     caches = {known: kind for known, kind in classes.items() if issubclass(kind, RadianceCache)}
     if name not in caches:
         raise unknown_name("radiance cache", name, caches)

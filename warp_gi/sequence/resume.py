@@ -155,6 +155,9 @@ def shots_of(camera: Camera | CameraPath, frames: Sequence[int], pattern: str | 
     Raises OptionError for a negative number, or several frames that would go to one file.
     """
     pattern = Path(pattern)
+    if len(set(frames)) < len(frames):
+        twice = sorted(index for index in set(frames) if list(frames).count(index) > 1)
+        raise OptionError(f"frame {twice[0]} is asked for twice, and both would go to one file; ask once")
     if len(frames) > 1 and "#" not in pattern.name:
         raise OptionError(f"{len(frames)} frames cannot all go to {pattern}; put #### in the name")
     at = camera.camera if isinstance(camera, CameraPath) else lambda index: camera
@@ -180,8 +183,7 @@ class SequenceRun:
     def bake(self) -> None:
         """Bake under the sky of the sequence's first frame, so that a resumed sequence has the same bake."""
         with self.scheduler.scene.lock:
-            self.scheduler.scene.update_sky(self.shots[0].time)
-            self.scheduler.bake()
+            self.scheduler.bake(self.shots[0].time)
 
     @cached_property
     def dependence(self) -> Dependence:
@@ -258,8 +260,7 @@ class SequenceRun:
     def _attributes(self, shot: Shot) -> dict[str, Attribute]:
         """Return what a frame's file has to say, under the sky of that frame."""
         with self.scheduler.scene.lock:
-            self.scheduler.scene.update_sky(shot.time)
-            metadata = self.scheduler.metadata()
+            metadata = self.scheduler.metadata(shot.time)
         if shot.lineage:
             metadata = metadata | {"lineage": shot.lineage}
         return frame_attributes(
@@ -281,6 +282,7 @@ class SequenceRun:
             known = load_bake(path).settings.get("lineage")
             if known not in lineages:
                 return 0
+            self.scheduler.bake(whole[lineages.index(known)].time)  # the state is of a frame under that sky
             self.scheduler.load_state(path, known)
         except BakeError:  # damaged, or of other settings
             return 0

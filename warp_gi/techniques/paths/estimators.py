@@ -11,9 +11,10 @@ import warp as wp
 from warp_gi import launch
 from warp_gi.alias import AliasTable
 from warp_gi.errors import OptionError
-from warp_gi.estimator import Estimator
+from warp_gi.estimator import Ahead, Estimator
 from warp_gi.kernels import path_samplers
 from warp_gi.radiance_cache import RadianceCache
+from warp_gi.scene.baked import whole_scene
 
 if TYPE_CHECKING:
     from warp_gi.baking import Bake
@@ -37,36 +38,55 @@ class TracedEnvironment(Estimator):
 
 
 @dataclass(frozen=True)
-class UniformLights(Estimator):
-    """Direct light from emissive triangles and punctual lights, each equally likely to be sampled. Unbiased."""
+class _TableLights(Estimator):
+    """Base of direct light from emitters picked by a table that stays the same over a sequence. Unbiased."""
 
     term: ClassVar[str] = "emitters"
+
+    def weights(self, scene: Scene) -> np.ndarray:
+        """Return relative probabilities of selecting each emitter, float64 [emitter_count]."""
+        raise NotImplementedError
 
     def bake_key(self, scene: Scene | BakedScene) -> str:
         """Return a hash of all but the sky."""
         return scene.contents_hash
 
     def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> wp.array | None:
-        """Return an alias table of equal probabilities, AliasBucket [emitter]; None without emitters."""
+        """Return an alias table over the emitters, AliasBucket [emitter]; None without emitters."""
         if scene.emitter_count == 0:
             return None
-        return AliasTable.build(np.ones(scene.emitter_count)).on(launch.get_device(device))
+        return AliasTable.build(self.weights(whole_scene(scene))).on(launch.get_device(device))
+
+    def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
+        """Return False: every frame has the same table."""
+        return False
+
+    def preprocess(self, frame: Frame, state: wp.array | None) -> wp.array | None:
+        """Let path vertices pick lights by the table."""
+        frame.paths.use_lights(path_samplers.ALIAS_LIGHTS, path_samplers.AliasLights(), state)
+        return state
 
     def trace(self, frame: Frame, state: wp.array | None) -> None:
-        """Ask the path tracer for this term, and to pick lights by the table."""
-        frame.paths.use_lights(path_samplers.ALIAS_LIGHTS, path_samplers.AliasLights(), state)
+        """Ask the path tracer for this term."""
         frame.paths.want(self.term)
 
 
 @dataclass(frozen=True)
-class PowerLights(Estimator):
+class UniformLights(_TableLights):
+    """Direct light from emissive triangles and punctual lights, each equally likely to be sampled. Unbiased."""
+
+    def weights(self, scene: Scene) -> np.ndarray:
+        """Return ones."""
+        return np.ones(scene.emitter_count)
+
+
+@dataclass(frozen=True)
+class PowerLights(_TableLights):
     """Direct light from emissive triangles and punctual lights, sampled in proportion to their power. Unbiased."""
 
-    term: ClassVar[str] = "emitters"
-
-    def trace(self, frame: Frame, state: None) -> None:
-        """Ask the path tracer for this term; it picks lights by power unless told otherwise."""
-        frame.paths.want(self.term)
+    def weights(self, scene: Scene) -> np.ndarray:
+        """Return each emitter's power."""
+        return scene.emitter_powers()
 
 
 @dataclass(frozen=True)

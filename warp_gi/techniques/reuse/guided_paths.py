@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from warp_gi.frame import Frame
     from warp_gi.scene.baked import BakedScene
     from warp_gi.scene.scene import Scene
-    from warp_gi.service import Service
+    from warp_gi.stateful import Service
 
 BITS = (32, 64, 96, 128)
 

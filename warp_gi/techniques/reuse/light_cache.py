@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from warp_gi.frame import Frame
     from warp_gi.scene.camera import Camera
     from warp_gi.scene.scene import Scene
-    from warp_gi.service import Service
+    from warp_gi.stateful import Service
 
 EXPLORES_BY = ("hierarchy", "table")
 LEAST_EXPLORATION, MOST_EXPLORATION = 0.05, 0.75

@@ -13,7 +13,7 @@ from warp_gi import launch
 from warp_gi.errors import OptionError, check_whole
 from warp_gi.kernels import octree as octree_kernels
 from warp_gi.kernels import samples as sample_kernels
-from warp_gi.service import Service
+from warp_gi.stateful import Service
 
 if TYPE_CHECKING:
     from warp_gi.baking import Bake

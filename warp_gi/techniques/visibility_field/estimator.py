@@ -181,7 +181,9 @@ class VisibilityField(Estimator):
         """
         if self.relight or not self._grows:
             return self.relight
-        return ahead is None or bool(whole_scene(scene).moving_objects) or ahead.state.lacks(ahead.views)
+        if ahead is None or ahead.state is None:
+            return True
+        return bool(whole_scene(scene).moving_objects) or ahead.state.lacks(ahead.views)
 
     def preprocess(self, frame: Frame, state: FieldState) -> FieldState:
         """Return the state for this frame: new cells within the budget, samples, the sky, and boxes of movers."""
