@@ -471,4 +471,4 @@ def test_learners_get_cached_light_as_light_of_the_way_there():
 def test_tracers_are_made_once_and_named_by_what_they_use():
     assert path_tracer(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY, NO_CACHE) is REFERENCE
     names = [tracer.trace_paths.module.name.rpartition(".")[2] for tracer in (REFERENCE, RECORDER, CACHED)]
-    assert names == ["alias_bsdf", "alias_bsdf_transfer", "alias_bsdf_steady"]
+    assert names == ["alias_bsdf", "alias_bsdf_sky_transfer", "alias_bsdf_cache_steady"]
