@@ -110,7 +110,8 @@ def plan_sequence(
 
     ``plan.frames`` are the numbers of the frames to render, ``plan.missing`` of those without a file, and
     ``plan.reason(index)`` says in words why a frame is rendered. What estimators need is baked for that, as a file
-    tells with which bake it was made: give ``bakes`` to do so once. Arguments and errors are those of ``render``.
+    tells with which bake it was made: give ``bakes`` to do so once. Arguments and errors are those of ``render``;
+    the scene is left under the sky of the last frame.
     """
     wanted = _frame_numbers(camera, frames)
     scheduler = FrameScheduler(scene, camera, pipeline or Pipeline(), device, seed, progress, bakes)

@@ -273,8 +273,7 @@ class FrameScheduler:
         """Return how ``frames`` (None: every one of the camera's path) depend on those rendered before them.
 
         ``sky_changes`` says that the scene gets another environment on the way, beside one that is a function of time.
-        It is ``Pipeline.dependence`` with
-        what this scheduler knows of the frames to come.
+        It is ``Pipeline.dependence`` with what this scheduler knows of the frames to come.
         """
         self.bake()
         if frames is None:
