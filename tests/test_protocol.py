@@ -1,5 +1,7 @@
 """What keeps a state over frames: who is asked when, what frames depend on, and mistakes that are told."""
 
+import gc
+import weakref
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -14,6 +16,7 @@ from warp_gi.errors import OptionError
 from warp_gi.pipeline import estimator_named, made
 from warp_gi.registry import Entry, Technique
 from warp_gi.sequence.resume import shots_of
+from warp_gi.techniques.reuse.sample_octree import Lesson
 
 NOTHING = gi.Pipeline(environment=None, emitters=None, indirect=None, spp=1, camera_samples=1)
 
@@ -155,6 +158,22 @@ def test_what_depends_on_all_of_the_scene_stays_while_the_scene_does():
     assert one.state("environment")[1] == 2
     one.frame(20)
     assert one.state("environment")[1] == 1  # by night it begins anew
+
+
+def test_a_frame_is_freed_with_its_last_name():
+    """Nothing of it waits for the garbage collector; nor do samples that were learnt from stay while it does."""
+    scheduler = gi.FrameScheduler(room(), still(), gi.Pipeline.preset("reuse", spp=1))
+    gc.collect()
+    gc.disable()
+    try:
+        for index in range(2):
+            frame = scheduler.frame(index)
+            alive = weakref.ref(frame)
+            assert frame.offered(Lesson) is None
+            del frame
+            assert alive() is None
+    finally:
+        gc.enable()
 
 
 # ---- dependence ----

@@ -185,6 +185,11 @@ class Frame:
         """Return what a service offered of a class in this frame, or None."""
         return self._offers.get(kind)
 
+    def finish(self) -> None:
+        """Forget what was handed over: the frame is done, and whoever keeps it wants its buffers."""
+        self._offers.clear()
+        self.paths.finish()
+
     # ---- camera samples ----
 
     def begin_view(self, view: int) -> None:

@@ -164,6 +164,10 @@ class PathRequest:
         regions, data = self._regions
         self.regions = SamplerInUse(regions, data(self))
 
+    def finish(self) -> None:
+        """Forget what makes the regions: it may hold the frame, which would then be freed late."""
+        self._regions = None
+
 
 def sky_probability(scene: Scene | BakedScene) -> float:
     """Return the probability that a path vertex samples the sky rather than an emitter: by power, from 0.2 to 0.8.

@@ -213,6 +213,7 @@ class FrameScheduler:
                 frame.keep_noisy()
                 states[DENOISER] = denoiser.apply(frame, states[DENOISER])
         self._states = states  # all or nothing
+        frame.finish()
         return frame
 
     def _new_frame(self, index: int, previous_index: int) -> Frame:
