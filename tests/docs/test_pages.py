@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import warp_gi as gi
+from warp_gi import registry
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -56,7 +57,16 @@ def test_a_changed_docstring_makes_a_page_stale():
     assert generate().filled(text.replace("| `max_depth` |", "| `most_depth` |")) == text
 
 
-@pytest.mark.parametrize("name", gi.__all__)
+DRAFTS = {
+    name
+    for one in registry.techniques().values()
+    for name in (*one.estimators, *one.services, *one.caches, *one.functions)
+    if not one.page
+}
+"""Public names of techniques that name no page yet."""
+
+
+@pytest.mark.parametrize("name", [name for name in gi.__all__ if name not in DRAFTS])
 def test_every_public_name_is_in_the_reference(name):
     pages = "\n".join(path.read_text(encoding="utf-8") for path in (DOCS / "reference/api").glob("*.md"))
     names = re.findall(r"<!-- names: (.*?) -->", pages)
@@ -68,7 +78,8 @@ def test_every_estimator_has_a_table_of_its_settings():
     for name in gi.__all__:
         value = getattr(gi, name)
         if (
-            isinstance(value, type)
+            name not in DRAFTS
+            and isinstance(value, type)
             and issubclass(value, (gi.Estimator, gi.Denoiser))
             and generate().attribute_docs(value)
         ):
