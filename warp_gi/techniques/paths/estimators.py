@@ -84,6 +84,12 @@ class UniformLights(_TableLights):
 class PowerLights(_TableLights):
     """Direct light from emissive triangles and punctual lights, sampled in proportion to their power. Unbiased."""
 
+    def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> wp.array | None:
+        """Return None: the scene has a table by power; or a table of the weights of a class of its own."""
+        if type(self).weights is PowerLights.weights:
+            return None
+        return super().start(scene, device, bake, seed)
+
     def weights(self, scene: Scene) -> np.ndarray:
         """Return each emitter's power."""
         return scene.emitter_powers()
