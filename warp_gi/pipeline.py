@@ -26,9 +26,9 @@ DENOISER = "denoise"
 """Place of the denoiser among states."""
 
 
-def _made(name: str) -> Any:
+def _default(name: str) -> Any:
     """Return a dataclass field whose default is a class of the registry with its own defaults."""
-    return field(default_factory=lambda: registry.find(name)())
+    return field(default_factory=lambda: made(name))
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class Pipeline:
     Raises OptionError for settings that make no sense.
     """
 
-    environment: Estimator | None = _made("TracedEnvironment")
+    environment: Estimator | None = _default("TracedEnvironment")
     """Estimator of direct light from the sky."""
-    emitters: Estimator | None = _made("PowerLights")
+    emitters: Estimator | None = _default("PowerLights")
     """Estimator of direct light from emissive triangles and punctual lights."""
-    indirect: Estimator | None = _made("BsdfPaths")
+    indirect: Estimator | None = _default("BsdfPaths")
     """Estimator of light that arrives over other surfaces."""
     spp: int = 16
     """Number of samples a pixel."""
@@ -55,7 +55,7 @@ class Pipeline:
     """Denoiser that makes the beauty of the noisy terms, or its name: "spatiotemporal", "oidn". The terms stay
     noisy."""
 
-    octree: Service = _made("SampleOctree")
+    octree: Service = _default("SampleOctree")
     """Octree of regions shared by the techniques that learn (``VisibilityLightCache``, ``GuidedPaths``)."""
 
     def __post_init__(self) -> None:

@@ -7,7 +7,7 @@ are names and numbers.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -84,12 +84,13 @@ def folder_of(technique: Technique) -> str:
     return next(f"{folders.__name__}.{name}" for name, one in techniques().items() if one is technique)
 
 
-def technique_named(name: str) -> Technique:
-    """Return the technique of a long or short name; raises OptionError for an unknown one."""
-    for one in techniques().values():
+def technique_named(name: str, among: Iterable[Technique] | None = None) -> Technique:
+    """Return the technique of a long or short name, of all or of some; raises OptionError for an unknown one."""
+    known = list(techniques().values() if among is None else among)
+    for one in known:
         if name in (one.name, one.short):
             return one
-    raise unknown_name("technique", name, [one.name for one in techniques().values()])
+    raise unknown_name("technique", name, [one.name for one in known])
 
 
 def bakeable() -> dict[str, Technique]:
@@ -98,8 +99,8 @@ def bakeable() -> dict[str, Technique]:
 
 
 def bake_tool(name: str) -> Any:
-    """Return the ``BakeTool`` of a technique; raises OptionError for an unknown name, KeyError if it has none."""
-    one = bakeable()[technique_named(name).name]
+    """Return the ``BakeTool`` of a technique that has one; raises OptionError for another name."""
+    one = technique_named(name, bakeable().values())
     return importlib.import_module(f"{folder_of(one)}.{one.bake_tool}").TOOL
 
 

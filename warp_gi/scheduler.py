@@ -129,7 +129,7 @@ class FrameScheduler:
 
     def _start_part(self, place: str, part: Stateful) -> None:
         """Start a part, unless all that it depends on is what it was."""
-        key = part.bake_key(self.scene) or self.scene.hash
+        key = self._key_of(part)
         if self._keys.get(place) != key:
             self._states[place], self._keys[place] = self._start(place, part), key
 
@@ -139,11 +139,10 @@ class FrameScheduler:
         if bake is None and place != DENOISER:
             self._progress(f"bake {place}", 0.0)
             told = lambda share: self._progress(f"bake {place}", share)  # noqa: E731
-            bake = self._made.get(self._bake_id(part)) or part.bake(
-                whole_scene(self.scene), device, self.seed, told, self.camera
-            )
+            identity = self._bake_id(part)
+            bake = self._made.get(identity) or part.bake(whole_scene(self.scene), device, self.seed, told, self.camera)
             if bake is not None and sum(type(one) is type(part) for one in self._parts.values()) > 1:
-                self._made[self._bake_id(part)] = bake  # for the other places of its class
+                self._made[identity] = bake  # for the other places of its class
         elif bake is not None and not isinstance(self.scene, BakedScene):
             settings = part.bake_settings(self.scene)
             bake.check(type(part).__name__, part.bake_key(self.scene), settings, self.scene.name)
@@ -152,10 +151,14 @@ class FrameScheduler:
             self._bake_digests[f"bake.{place}"] = bake.digest[:16]
         return part.start(self.scene, device, bake, self.seed)
 
+    def _key_of(self, part: Stateful) -> str:
+        """Return a hash of all in the scene that a part's bake and first state depend on."""
+        return part.bake_key(self.scene) or self.scene.hash
+
     def _bake_id(self, part: Stateful) -> tuple[str, str, str]:
         """Return what decides a part's bake: equal ones have the same."""
         settings = sorted(part.bake_settings(self.scene).items())
-        return type(part).__name__, part.bake_key(self.scene) or self.scene.hash, repr(settings)
+        return type(part).__name__, self._key_of(part), repr(settings)
 
     def _bake_for(self, part: Stateful) -> Bake | None:
         """Return the bake that was given for a part, or None.
@@ -217,16 +220,16 @@ class FrameScheduler:
         return frame
 
     def _new_frame(self, index: int, previous_index: int) -> Frame:
-        fps = self.camera.fps if isinstance(self.camera, CameraPath) else 24.0
         started, compiled = time.perf_counter(), launch.compile_seconds
-        self.scene.update(index / fps, previous_index / fps, self.device)
+        now = frame_time(self.camera, index)
+        self.scene.update(now, frame_time(self.camera, previous_index), self.device)
         data = launch.copied(self.scene.data(self.device), types.SceneData)
         data.emitters = launch.copied(data.emitters, types.Emitters)
-        if not isinstance(self.scene, BakedScene) and self.scene.emitter_count:
+        if self.scene.emitter_count:
             data.emitters.alias = whole_scene(self.scene).light_table(self.device)
         cameras = self._camera_at(index), self._camera_at(previous_index)
         settings, seed = self.pipeline.frame_settings, _mix(self.seed, index)
-        frame = Frame(self.scene, data, *cameras, settings, self.device, index, index / fps, seed, previous_index)
+        frame = Frame(self.scene, data, *cameras, settings, self.device, index, now, seed, previous_index)
         compiled = launch.compile_seconds - compiled
         frame.timings |= {"bake": self._bake_seconds, "compile": compiled}
         frame.timings["scene"] = time.perf_counter() - started - compiled

@@ -48,9 +48,9 @@ class Stateful:
         """Refuse methods of an earlier protocol, which nobody would call."""
         super().__init_subclass__(**more)
         for name, instead in _EARLIER.items():
-            if name in vars(cls) and "after" not in vars(cls):
-                if name != "learn" or cls.after is Stateful.after:
-                    raise TypeError(f"{cls.__name__}.{name} is of an earlier version and never called: {instead}")
+            is_called = name == "learn" and cls.after is not Stateful.after  # by its own ``after``
+            if name in vars(cls) and not is_called:
+                raise TypeError(f"{cls.__name__}.{name} is of an earlier version and never called: {instead}")
 
     def __post_init__(self) -> None:
         self.validate()

@@ -24,7 +24,7 @@ from warp_gi.cli.inputs import (
 )
 from warp_gi.cli.options import flag, parse_options, value_given
 from warp_gi.cli.report import Reporter, run_command
-from warp_gi.errors import OptionError, unknown_name
+from warp_gi.errors import OptionError
 from warp_gi.estimator import Estimator
 from warp_gi.files import check_writable, remove_stale_parts
 from warp_gi.rendering import bake
@@ -104,10 +104,7 @@ def technique_of(arguments: Sequence[str]) -> str:
     Raises OptionError for an unknown one, and for a flag that is a setting of another one only.
     """
     given = value_given(arguments, "--technique")
-    long_names = {one.short: name for name, one in BAKEABLE.items()}
-    chosen = DEFAULT_TECHNIQUE if given is None else long_names.get(given, given)
-    if chosen not in BAKEABLE:
-        raise unknown_name("technique", chosen, BAKEABLE)
+    chosen = DEFAULT_TECHNIQUE if given is None else registry.technique_named(given, BAKEABLE.values()).name
     names = {name: {field.name for field in fields(tool_of(name).settings)} for name in BAKEABLE}
     for argument in arguments:
         flag = argument.partition("=")[0]
