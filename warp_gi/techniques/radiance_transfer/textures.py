@@ -1,0 +1,85 @@
+"""What a bake of radiance transfer holds: an atlas, and rows of numbers for its slots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_gi.baking import Bake
+from warp_gi.errors import BakeError
+from warp_gi.kernels.transfer_atlas import TransferAtlas
+from warp_gi.launch import on_device
+
+TECHNIQUE = "RadianceTransfer"
+LIGHT_NUMBERS = 25
+"""Coefficients of the sky a channel, and so of what bounces (order 5)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Atlas:
+    """Where transfer is kept on the surfaces of a scene; ``kernels/transfer_atlas.py`` says how it is read.
+
+    A slot is a place on one side of a surface. Those of the fronts come first.
+    """
+
+    corners: np.ndarray
+    """Corners of faces in texels of their page, float32 [faces, 3, 2]; empty [0, 3, 2] for vertices."""
+    face_pages: np.ndarray
+    """Page of each face, int32 [faces]; -1 for faces without texels: degenerate ones, and those that move."""
+    charts: np.ndarray
+    """Chart of each face, int32 [faces], counted over all pages; -1 without one."""
+    pages: np.ndarray
+    """First texel, width and height of each page, int32 [pages, 3]."""
+    slots: np.ndarray
+    """Slot of each texel by side, int32 [2, texels]; -1 where nothing is kept."""
+    corner_slots: np.ndarray
+    """Slots of the corners of faces by side, int32 [2, faces, 3], for vertices; else empty [0, 0, 3]."""
+    slot_faces: np.ndarray
+    """Face on which each slot lies, int32 [slots]."""
+    slot_points: np.ndarray
+    """Barycentric coordinates u, v of each slot in its face, float32 [slots, 2]."""
+    slot_sides: np.ndarray
+    """Side of each slot, uint8 [slots]: 0 front, 1 back."""
+
+    @property
+    def count(self) -> int:
+        """Number of slots."""
+        return len(self.slot_faces)
+
+    def on(self, device: wp.Device) -> TransferAtlas:
+        """Return the atlas as kernels read it."""
+        result = TransferAtlas()
+        result.corners = on_device(self.corners, wp.vec2, device)
+        result.face_pages = on_device(self.face_pages, wp.int32, device)
+        result.pages = on_device(self.pages, wp.vec3i, device)
+        result.slots = on_device(self.slots, wp.int32, device)
+        result.corner_slots = on_device(self.corner_slots, wp.vec3i, device)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class TransferTextures:
+    """Transfer at each slot of an atlas, as a bake holds it."""
+
+    atlas: Atlas
+    transfer: np.ndarray
+    """T_j = int V max(n.w, 0) y_j dw [sr], float16 [slots, order^2]."""
+    bounces: np.ndarray
+    """Sums over bounces of the transfer of reflected light by channel, float16 [slots, 3, 25]; or [0, 3, 25]."""
+    lamps: np.ndarray
+    """Irradiance by light of the scene's emitters that was reflected before, float32 [slots, 3]; or [0, 3]."""
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return all arrays by name, for a Bake."""
+        atlas = {f"atlas_{name}": array for name, array in vars(self.atlas).items()}
+        return {**atlas, "transfer": self.transfer, "bounces": self.bounces, "lamps": self.lamps}
+
+
+def transfer_textures(bake: Bake) -> TransferTextures:
+    """Return what a bake holds; raises BakeError for a bake of another technique."""
+    if bake.technique != TECHNIQUE:
+        raise BakeError(f"expected a bake of {TECHNIQUE}, got one of {bake.technique}")
+    atlas = Atlas(**{name: bake.arrays[f"atlas_{name}"] for name in Atlas.__dataclass_fields__})
+    return TransferTextures(atlas, bake.arrays["transfer"], bake.arrays["bounces"], bake.arrays["lamps"])
