@@ -32,6 +32,7 @@ class TransferRows:
 class TransferSky:
     light: wp.array(dtype=wp.float32)  # [3, width] without suns: direct light
     whole_light: wp.array(dtype=wp.float32)  # [3, 32] with suns: light over other surfaces
+    matrix: wp.array(dtype=wp.float32)  # [order^2, 3, width] of light without suns: sum_i C_ijk L_i, for lobes
     sun_count: wp.int32
     sun_directions: wp.array(dtype=wp.vec3)
     sun_irradiances: wp.array(dtype=wp.vec3)  # W/m^2 perpendicular to the direction
