@@ -1,4 +1,4 @@
-"""Products of rows of transfer, eight numbers at a time on the CPU; a plain loop on CUDA, whose threads are lanes already.
+"""Products of rows of transfer, eight numbers at a time on the CPU; on CUDA, whose threads are lanes already, a loop.
 
 A row of transfer has 25 numbers padded to 32, or 36 padded to 40, as halves: 32 are one cache line. Rows are read,
 blended and multiplied in registers. Loops in Warp itself, over vectors of 25, were 28 times slower.
