@@ -174,8 +174,8 @@ class RadianceTransfer(Estimator, RadianceCache):
             return  # the first of them did it
         query, buffers = transfer_shade.TransferQuery(), transfer_shade.TransferBuffers()
         buffers.width, buffers.height = frame.camera.resolution
+        query.terms = sum(TERM_BITS[one.term] for one in alike)
         for one in alike:
-            query.terms |= TERM_BITS[one.term]
             setattr(buffers, one.term, frame[one.term])
             for order, moment in enumerate(frame.moments(one.term), 1):
                 setattr(buffers, f"{one.term}_moment{order}", moment)
