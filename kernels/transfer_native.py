@@ -203,7 +203,8 @@ _VECTOR_HALVES = "!defined(__CUDA_ARCH__) && (defined(__F16C__) || defined(__aar
             for (int line = 0; line < 3; ++line) __builtin_prefetch(later + 64 * line);
         }}
         if (hit[i] < 0) continue;
-        const h8* row = (const h8*)(rows.data + (long long)hit[i] * 80);
+        h8 row[10];
+        __builtin_memcpy(row, rows.data + (long long)hit[i] * 80, sizeof(row));
         for (int k = 0; k < 10; ++k) sums[k] += __builtin_convertvector(row[k], f8);
     }}
     for (int k = 0; k < 10; ++k) {{
@@ -227,9 +228,11 @@ _VECTOR_HALVES = "!defined(__CUDA_ARCH__) && (defined(__F16C__) || defined(__aar
     for (int k = 0; k < 80; k += 8) {{
         f8 value;
         __builtin_memcpy(&value, mean + k, sizeof(f8));
-        *(h8*)(kept + k) = __builtin_convertvector(value, h8);
+        h8 halves = __builtin_convertvector(value, h8);
+        __builtin_memcpy(kept + k, &halves, sizeof(h8));
         __builtin_memcpy(&value, reflected + k, sizeof(f8));
-        *(h8*)(target + k) = __builtin_convertvector(value, h8);
+        halves = __builtin_convertvector(value, h8);
+        __builtin_memcpy(target + k, &halves, sizeof(h8));
     }}
 #else
     for (int k = 0; k < 80; ++k) {{
