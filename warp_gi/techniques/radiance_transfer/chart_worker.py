@@ -30,9 +30,7 @@ MOST_PACKS = 10
 
 
 def cut(points: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return uv [triangle, 3, 2] in texels of some page, and the chart of each triangle, int32, -1 without one.
-
-    """
+    """Return uv [triangle, 3, 2] in texels of some page, and the chart of each triangle, int32, -1 without one."""
     atlas = xatlas.Atlas()
     atlas.add_mesh(points, indices)
     pack = xatlas.PackOptions()
@@ -77,9 +75,7 @@ def pack(uvs: np.ndarray, charts: np.ndarray, size: int, tell: Callable[[float],
     return {"corners": best[0], "is_placed": best[1], "page": np.array(best[2], np.int32)}
 
 
-def _packed(
-    uvs: np.ndarray, charts: np.ndarray, scale: float
-) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
+def _packed(uvs: np.ndarray, charts: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
     """Return corners, which triangles have some, and width and height of the page at ``scale`` texels a unit."""
     atlas = xatlas.Atlas()
     points, places = _welded(uvs, charts)
