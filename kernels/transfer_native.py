@@ -185,7 +185,7 @@ _VECTOR_HALVES = "!defined(__CUDA_ARCH__) && (defined(__F16C__) || defined(__aar
 
 
 # Gathers at a slot what its hits reflect, the mean of rows [slot, 80] over hits [slot, ray], with nothing from those
-# below 0. Writes it to bounces [slot, 80], and what the slot reflects of it and of direct light itself to next.
+# below 0. Writes it to bounces [slot, 75], and what the slot reflects of it and of direct light itself to next.
 # Returns the means of the first number of each channel.
 @wp.func_native(
     snippet=f"""
@@ -222,23 +222,25 @@ _VECTOR_HALVES = "!defined(__CUDA_ARCH__) && (defined(__F16C__) || defined(__aar
     float reflected[80] = {{}};
     const auto* direct = transfer.data + (long long)slot * transfer.shape[1];
     for (int k = 0; k < 75; ++k) reflected[k] = albedo[k / 25] * ((float)direct[k % 25] + mean[k]);
-    auto* kept = bounces.data + (long long)slot * 80;
+    auto* kept = bounces.data + (long long)slot * 75;
     auto* target = next.data + (long long)slot * 80;
 #if {_VECTOR_HALVES}
-    for (int k = 0; k < 80; k += 8) {{
+    h8 halves[10];
+    for (int k = 0; k < 10; ++k) {{
         f8 value;
-        __builtin_memcpy(&value, mean + k, sizeof(f8));
-        h8 halves = __builtin_convertvector(value, h8);
-        __builtin_memcpy(kept + k, &halves, sizeof(h8));
-        __builtin_memcpy(&value, reflected + k, sizeof(f8));
-        halves = __builtin_convertvector(value, h8);
-        __builtin_memcpy(target + k, &halves, sizeof(h8));
+        __builtin_memcpy(&value, reflected + 8 * k, sizeof(f8));
+        halves[k] = __builtin_convertvector(value, h8);
     }}
+    __builtin_memcpy(target, halves, sizeof(halves));
+    for (int k = 0; k < 10; ++k) {{
+        f8 value;
+        __builtin_memcpy(&value, mean + 8 * k, sizeof(f8));
+        halves[k] = __builtin_convertvector(value, h8);
+    }}
+    __builtin_memcpy(kept, halves, 75 * sizeof(_Float16));
 #else
-    for (int k = 0; k < 80; ++k) {{
-        kept[k] = wp::half(mean[k]);
-        target[k] = wp::half(reflected[k]);
-    }}
+    for (int k = 0; k < 80; ++k) target[k] = wp::half(reflected[k]);
+    for (int k = 0; k < 75; ++k) kept[k] = wp::half(mean[k]);
 #endif
     return wp::vec3(mean[0], mean[25], mean[50]);
 """

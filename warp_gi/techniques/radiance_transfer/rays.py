@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -100,9 +101,9 @@ def trace_slots(work: TransferWork, progress: Progress | None = None) -> TracedT
     """Trace the rays of all slots; the same, to the bit, on any number of threads."""
     count, rays, device = work.count, work.rays, work.device
     results = kernels.TransferResults()
-    results.transfer = _filled((count, rays.order**2), wp.float16, device)
-    results.hits = _filled((count, rays.bounce_rays), wp.int32, device)
-    results.rays = _filled((count,), wp.int32, device)
+    results.transfer = filled((count, rays.order**2), wp.float16, device)
+    results.hits = filled((count, rays.bounce_rays), wp.int32, device)
+    results.rays = filled((count,), wp.int32, device)
 
     def run(start: int, slots: int) -> None:
         inputs = [start, work.data, work.atlas, work.slots, rays, results]
@@ -112,6 +113,7 @@ def trace_slots(work: TransferWork, progress: Progress | None = None) -> TracedT
     return TracedTransfer(results.transfer.numpy(), results.hits.numpy(), results.rays.numpy())
 
 
-def _filled(shape: tuple[int, ...], dtype: type, device: wp.Device) -> wp.array:
-    """Return an array of zeros in memory that NumPy allocated, if it is on the CPU: see ``on_device``."""
-    return on_device(np.zeros(shape, wp.dtype_to_numpy(dtype)), dtype, device)
+def filled(shape: tuple[int, ...], dtype: Any, device: wp.Device) -> wp.array:
+    """Return an array of zeros [shape] of ``dtype``, in memory that NumPy allocated if on the CPU: see ``on_device``."""
+    scalar, size = (wp.float32, (dtype._length_,)) if dtype in (wp.vec2, wp.vec3) else (dtype, ())
+    return on_device(np.zeros((*shape, *size), wp.dtype_to_numpy(scalar)), dtype, device)
