@@ -105,7 +105,12 @@ def lamp_irradiance(work: TransferWork, scene: Scene, seed: int, progress: Progr
 
 
 def gather_light(
-    work: TransferWork, traced: TracedTransfer, reflectance: np.ndarray, direct: np.ndarray, bounces: int, tolerance: float
+    work: TransferWork,
+    traced: TracedTransfer,
+    reflectance: np.ndarray,
+    direct: np.ndarray,
+    bounces: int,
+    tolerance: float,
 ) -> list[np.ndarray]:
     """Return the irradiance after each bounce of light that first arrives as ``direct`` [slots, 3], float32 each.
 
