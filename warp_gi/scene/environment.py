@@ -32,12 +32,12 @@ from warp_gi.launch import get_device, on_device
 from warp_gi.scene import harmonics
 from warp_gi.scene.model import Color
 from warp_gi.scene.sky import SunSky, node_solid_angles
-from warp_gi.scene.sun import MOST_SUNS, MapSplit, SunSplit, split_map
+from warp_gi.scene.sun import LAMPS_SHARE, MOST_SUNS, MapSplit, split_map
 from warp_gi.scene.watching import Watch
 
 T = TypeVar("T")
 
-__all__ = ["Environment", "SunSky", "as_environment"]
+__all__ = ["Environment", "SunSky", "SunSplit", "as_environment"]
 
 LARGEST_HEIGHT = 4096  # texel coordinates must be exact in float32 with bits left to interpolate
 NEGLIGIBLE_NEGATIVE = 1e-4  # share of the sum of all pixels; less is set to 0
@@ -274,6 +274,34 @@ class Environment:
             arrays = self._map.on(target)
             result.texels, result.alias, result.pdf_scale = arrays
         return result
+
+
+@dataclass(frozen=True, eq=False)
+class SunSplit:
+    """A sky in two parts, which add up to the whole: its suns, and the rest."""
+
+    rest: Environment
+    """The sky without its suns; the sky itself where there are none."""
+    directions: np.ndarray
+    """Unit directions towards the suns in world space, brightest first, float64 [suns, 3]."""
+    irradiances: np.ndarray
+    """Irradiance of a surface that faces a sun, W/m^2, float64 [suns, 3]: the integral of what left the map."""
+    cos_cones: np.ndarray
+    """Cosines of the half-angles of cones that hold all light of each sun, float64 [suns]."""
+    cos_discs: np.ndarray
+    """Cosines of the half-angles of even discs as wide as each sun (of the same second moment), float64 [suns]."""
+    share: float
+    """Share of the sky's light (luminance, from all directions) that the suns hold."""
+
+    @property
+    def warning(self) -> str | None:
+        """One line for those to whom the rest is what counts, where the suns hold most of the light; else None."""
+        if self.share <= LAMPS_SHARE:
+            return None
+        return (
+            f"{self.rest.name}: {len(self.directions)} small lamps hold {self.share:.0%} of this sky's light;"
+            " as spherical harmonics it is a poor likeness, and is better traced"
+        )
 
 
 Sky = Environment | SunSky | str | Path | float | Sequence[float] | np.ndarray | None

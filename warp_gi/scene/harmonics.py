@@ -95,8 +95,8 @@ def rotate(coefficients: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 def ring_coefficients(pixels: np.ndarray, order: int) -> np.ndarray:
     """Return complex coefficients [order (degree m), order (band l), 3] of a map, about its own up axis; 0 for l < m.
 
-    The map is sum_m Re((2 - [m = 0]) c_m P_lm(cos polar angle) exp(i m azimuth)) with orthonormal P_lm, azimuth 2 pi u as
-    ``Environment`` has it. Exact for radiance that is bilinear between nodes, and fast at high orders.
+    The map is sum_m Re((2 - [m = 0]) c_m P_lm(cos polar angle) exp(i m azimuth)) with orthonormal P_lm, azimuth 2 pi u
+    as ``Environment`` has it. Exact for radiance that is bilinear between nodes, and fast at high orders.
     """
     height, width = pixels.shape[:2]
     order_seen = min(order, width // 2)  # of higher degrees a map knows nothing
