@@ -12,7 +12,7 @@ from warp_gi.kernels import harmonics as kernels
 from warp_gi.kernels import visibility_field as field
 from warp_gi.launch import launch
 from warp_gi.scene.environment import Environment
-from warp_gi.scene.harmonics import basis, project, rotate
+from warp_gi.scene.harmonics import basis, by_coefficient, project, ring_coefficients, ring_pixels, rotate, sphere
 
 wp.set_module_options({"enable_backward": False})
 
@@ -54,7 +54,7 @@ def random_rotation(seed=2):
     return q * np.sign(np.linalg.det(q))
 
 
-def sphere():
+def quadrature():
     """Directions and weights that integrate polynomials of degree 31 over the sphere exactly, z up."""
     z, weights = np.polynomial.legendre.leggauss(16)
     phi = np.arange(32) * 2 * np.pi / 32
@@ -81,9 +81,31 @@ def evaluated(directions):
 def test_basis_is_that_of_textbooks():
     """Real harmonics from complex ones: m < 0 is sqrt(2) Im, m > 0 is sqrt(2) Re, no Condon-Shortley sign."""
     d = random_directions(500)
+    assert np.abs(basis(d) - textbook(d, 3)).max() < 1e-12
+    assert np.abs(evaluated(d)[0] - textbook(d, 3)).max() < 1e-6
+    assert basis(d.reshape(5, 100, 3)).shape == (5, 100, 9)
+
+
+@pytest.mark.parametrize("order", [1, 2, 4, 5, 6, 7, 12])
+def test_basis_of_any_order(order):
+    d = np.concatenate([random_directions(200), np.eye(3), -np.eye(3)])
+    y = basis(d, order)
+    assert y.shape == (206, order * order)
+    assert np.abs(y - textbook(d, order)).max() < 1e-12
+    known = min(order, 3) ** 2
+    assert np.abs(y[:, :known] - basis(d)[:, :known]).max() < 1e-14
+    directions, weights = quadrature()
+    y = basis(directions, order)
+    assert np.abs(np.einsum("n,ni,nj->ij", weights, y, y) - np.eye(order * order)).max() < 1e-12
+    directions, weights = sphere(2 * order - 2)
+    y = basis(directions, order)
+    assert np.abs(np.einsum("n,ni,nj->ij", weights, y, y) - np.eye(order * order)).max() < 1e-12
+
+
+def textbook(d, order):
     colatitude, azimuth = np.arccos(d[:, 2]), np.arctan2(d[:, 1], d[:, 0])
     expected = []
-    for l in range(3):
+    for l in range(order):
         for m in range(-l, l + 1):
             if hasattr(special, "sph_harm_y"):
                 y = special.sph_harm_y(l, abs(m), colatitude, azimuth)
@@ -91,13 +113,21 @@ def test_basis_is_that_of_textbooks():
                 y = special.sph_harm(abs(m), l, azimuth, colatitude)
             y = y * (-1) ** m
             expected.append(y.real if m == 0 else np.sqrt(2) * (y.imag if m < 0 else y.real))
-    assert np.abs(basis(d) - np.stack(expected, axis=-1)).max() < 1e-12
-    assert np.abs(evaluated(d)[0] - np.stack(expected, axis=-1)).max() < 1e-6
-    assert basis(d.reshape(5, 100, 3)).shape == (5, 100, 9)
+    return np.stack(expected, axis=-1)
+
+
+def test_functions_of_the_fourth_and_fifth_band():
+    """Polynomials written out (Sloan, "Stupid Spherical Harmonics Tricks", appendix A2)."""
+    x, y, z = (d := random_directions(50)).T
+    found = basis(d, 6)
+    assert np.allclose(found[:, 20], 3 / 16 / np.sqrt(np.pi) * (35 * z**4 - 30 * z**2 + 3))
+    assert np.allclose(found[:, 16], 0.75 * np.sqrt(35 / np.pi) * x * y * (x * x - y * y))
+    assert np.allclose(found[:, 30], np.sqrt(11 / np.pi) / 16 * (63 * z**5 - 70 * z**3 + 15 * z))
+    assert np.allclose(found[:, 35], 3 / 32 * np.sqrt(154 / np.pi) * x * (x**4 - 10 * x * x * y * y + 5 * y**4))
 
 
 def test_basis_is_orthonormal():
-    directions, weights = sphere()
+    directions, weights = quadrature()
     for y in (basis(directions), evaluated(directions)[0].astype(np.float64)):
         assert np.abs(np.einsum("n,ni,nj->ij", weights, y, y) - np.eye(9)).max() < 1e-6
 
@@ -138,12 +168,52 @@ def test_rotating_coefficients_is_rotating_the_sky():
     turned = rotate(coefficients, rotation)
     d = random_directions(200)
     assert np.abs(basis(d @ rotation.T) @ turned.T - basis(d) @ coefficients.T).max() < 1e-12
-    directions, weights = sphere()
+    directions, weights = quadrature()
     values = basis(directions @ rotation) @ coefficients.T
     assert np.abs(turned - np.einsum("n,nc,ni->ci", weights, values, basis(directions))).max() < 1e-12
     assert np.allclose(rotate(coefficients, np.eye(3)), coefficients)
     assert np.allclose(rotate(turned, rotation.T), coefficients)
     assert np.allclose((turned**2).sum(axis=1), (coefficients**2).sum(axis=1))
+
+
+@pytest.mark.parametrize("order", [2, 5, 6, 7])
+def test_any_order_is_projected_and_rotated(order):
+    rng = np.random.default_rng(order)
+    coefficients, rotation = rng.normal(size=(3, order * order)), random_rotation()
+    turned = rotate(coefficients, rotation)
+    d = random_directions(200)
+    assert np.abs(basis(d @ rotation.T, order) @ turned.T - basis(d, order) @ coefficients.T).max() < 1e-12
+    assert np.abs(rotate(turned, rotation.T) - coefficients).max() < 1e-12
+    assert np.allclose((turned**2).sum(axis=1), (coefficients**2).sum(axis=1))
+    errors = []
+    for height in (32, 128):
+        found = project(basis(map_directions(height), order) @ coefficients.T, order)
+        assert found.shape == (3, order * order)
+        errors.append(np.abs(found - coefficients).max())
+    assert errors[0] < 0.07 and errors[1] < errors[0] / 10
+    pixels = rng.random((16, 32, 3))
+    known = min(order, 3) ** 2
+    assert np.allclose(project(pixels, order)[:, :known], project(pixels)[:, :known], rtol=0, atol=1e-12)
+
+
+def test_maps_of_high_orders_go_to_rings_and_back():
+    order, rng = 20, np.random.default_rng(5)
+    coefficients, errors = rng.normal(size=(25, 3)), []
+    for height in (64, 256):
+        pixels = basis(map_directions(height), 5) @ coefficients
+        rings = ring_coefficients(pixels, order)
+        assert rings.shape == (order, order, 3)
+        errors.append(np.abs(ring_pixels(rings, height) - pixels).max())
+    assert errors[0] < 0.15 and errors[1] < errors[0] / 10
+    rings[:, 5:] = 0
+    expected = basis(map_directions(16), 5) @ project(pixels, 5).T
+    assert expected.shape == (16, 32, 3)
+    assert np.abs(ring_pixels(rings, 16) - expected).max() < 1e-12
+    assert not ring_coefficients(pixels[:3, :4], 8)[2:].any()  # beyond what four columns can tell
+
+
+def test_factors_of_bands():
+    assert by_coefficient(np.array([1.0, 2.0, 3.0])).tolist() == [1, 2, 2, 2, 3, 3, 3, 3, 3]
 
 
 def test_environments_of_one_colour_have_one_harmonic():
@@ -167,6 +237,14 @@ def test_environments_turn_and_scale():
         turned = sky.rotated(columns * 180 / height)
         assert np.allclose(turned.harmonics, project(np.roll(pixels, -columns, axis=1)), atol=1e-9)
         assert not np.allclose(turned.harmonics, sky.harmonics, atol=0.05)
+        expected = project(np.roll(pixels, -columns, axis=1), 5)
+        assert np.allclose(turned.harmonics_of(5), expected, rtol=0, atol=1e-9)
+    assert np.array_equal(sky.harmonics_of(3), sky.harmonics)
+    constant = Environment(color=(1.0, 2.0, 0.5)).rotated(30).harmonics_of(6)
+    assert constant[:, 0] == pytest.approx(np.array([1.0, 2.0, 0.5]) * np.sqrt(4 * np.pi)) and not constant[:, 1:].any()
+    sky.data("cpu")
+    pixels[:] = 1.0
+    assert np.allclose(sky.renewed().harmonics_of(5), project(pixels, 5))
 
 
 def test_sky_of_harmonics_lies_as_the_map_does():

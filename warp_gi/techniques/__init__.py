@@ -6,4 +6,5 @@ TECHNIQUES = (
     "visibility_field",
     "light_field",
     "reuse",
+    "radiance_transfer",
 )

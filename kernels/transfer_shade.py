@@ -1,0 +1,90 @@
+"""Light of a frame from transfer textures: no ray but one to each sun."""
+
+import warp as wp
+
+from warp_gi.kernels.bsdf import average_reflectance
+from warp_gi.kernels.gbuffer import PassSettings, PrimaryHits, tiled_pixel
+from warp_gi.kernels.surface import surface_at
+from warp_gi.kernels.transfer_light import (
+    TransferRows,
+    TransferSky,
+    bounced_irradiance,
+    diffuse_radiance,
+    sun_radiance,
+    surface_slots,
+)
+from warp_gi.kernels.types import SceneData
+
+wp.set_module_options({"enable_backward": False})
+
+WANTS_ENVIRONMENT = wp.constant(1)
+WANTS_INDIRECT = wp.constant(2)
+
+
+# What a launch is asked for.
+@wp.struct
+class TransferQuery:
+    terms: wp.int32  # WANTS_*
+
+
+# Sums over samples, [height * width], of each term, of its samples and of their squares.
+@wp.struct
+class TransferBuffers:
+    width: wp.int32
+    height: wp.int32
+    environment: wp.array(dtype=wp.vec3)
+    environment_moment1: wp.array(dtype=wp.vec3)
+    environment_moment2: wp.array(dtype=wp.vec3)
+    indirect: wp.array(dtype=wp.vec3)
+    indirect_moment1: wp.array(dtype=wp.vec3)
+    indirect_moment2: wp.array(dtype=wp.vec3)
+
+
+# Adds radiance that stands for `count` equal samples.
+@wp.func
+def add_equal(
+    sums: wp.array(dtype=wp.vec3),
+    moment1: wp.array(dtype=wp.vec3),
+    moment2: wp.array(dtype=wp.vec3),
+    pixel: wp.int32,
+    radiance: wp.vec3,
+    count: wp.float32,
+):
+    light = radiance * count
+    sums[pixel] = sums[pixel] + light
+    moment1[pixel] = moment1[pixel] + light
+    moment2[pixel] = moment2[pixel] + wp.cw_mul(light, radiance)
+
+
+# Thread: a pixel. Adds the light that its surface reflects in the current camera sample.
+@wp.kernel
+def shade_transfer(
+    first: wp.int32,
+    scene: SceneData,
+    settings: PassSettings,
+    rows: TransferRows,
+    sky: TransferSky,
+    query: TransferQuery,
+    hits: PrimaryHits,
+    buffers: TransferBuffers,
+):
+    p = tiled_pixel(first + wp.tid(), buffers.width)
+    if p[0] >= buffers.width or p[1] >= buffers.height:
+        return
+    pixel = p[1] * buffers.width + p[0]
+    face = hits.face[pixel]
+    if face < 0:
+        return
+    direction = hits.direction[pixel]
+    s = surface_at(scene, face, hits.u[pixel], hits.v[pixel], -direction)
+    at = surface_slots(rows, scene, s, face, hits.u[pixel], hits.v[pixel])
+    count = wp.float32(settings.sample_count)
+    if (query.terms & WANTS_ENVIRONMENT) != 0:
+        light = wp.max(diffuse_radiance(rows, sky, s, at), wp.vec3(0.0, 0.0, 0.0))
+        if sky.sun_count > 0:
+            light = light + sun_radiance(scene, sky, s, wp.transpose(s.shading) * -direction)
+        b = buffers
+        add_equal(b.environment, b.environment_moment1, b.environment_moment2, pixel, light, count)
+    if (query.terms & WANTS_INDIRECT) != 0:
+        light = wp.cw_mul(average_reflectance(s.bsdf), bounced_irradiance(rows, sky, at)) / wp.pi
+        add_equal(buffers.indirect, buffers.indirect_moment1, buffers.indirect_moment2, pixel, light, count)

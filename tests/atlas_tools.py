@@ -1,0 +1,65 @@
+"""Atlases of transfer textures, read on the host."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from warp_gi.scene.scene import Scene
+from warp_gi.techniques.radiance_transfer.settings import TransferSettings
+from warp_gi.techniques.radiance_transfer.textures import Atlas
+
+
+def settings(**changes) -> TransferSettings:
+    """Return settings of a small atlas."""
+    values = {
+        "storage": "texture", "resolution": 128, "texel_sets": "one", "charts": "xatlas", "chart_seconds": 0.0,
+        "order": 5, "first_rays": 64, "rays": 512, "bounce_rays": 64, "bounces": 4, "tolerance": 0.002,
+    }  # fmt: skip
+    return TransferSettings(**{**values, **changes})
+
+
+def fetched(atlas: Atlas, faces: np.ndarray, u: np.ndarray, v: np.ndarray, side: int = 0):
+    """Return the four slots [n, 4] around points of faces, and their bilinear shares, of which none is left out."""
+    page = atlas.pages[atlas.face_pages[faces]].astype(np.int64)
+    weights = np.stack([1.0 - u - v, u, v], axis=1)
+    at = (atlas.corners[faces] * weights[..., None]).sum(axis=1) - 0.5
+    at = np.clip(at, 0.0, page[:, 1:] - 1.0)
+    low = np.floor(at).astype(np.int64)
+    high = np.minimum(low + 1, page[:, 1:] - 1)
+    f = at - low
+    slots, shares = [], []
+    for y, fy in ((low[:, 1], 1 - f[:, 1]), (high[:, 1], f[:, 1])):
+        for x, fx in ((low[:, 0], 1 - f[:, 0]), (high[:, 0], f[:, 0])):
+            slots.append(atlas.slots[side, page[:, 0] + y * page[:, 1] + x])
+            shares.append(fx * fy)
+    return np.stack(slots, axis=1), np.stack(shares, axis=1)
+
+
+def slot_positions(scene: Scene, atlas: Atlas) -> np.ndarray:
+    """Return where slots lie, float64 [slot, 3]."""
+    return positions(scene, atlas.slot_faces, *atlas.slot_points.T.astype(np.float64))
+
+
+def positions(scene: Scene, faces: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Return points of faces, float64 [n, 3]."""
+    corners = scene._flat.points[scene._flat.indices[faces]].astype(np.float64)
+    return (corners * np.stack([1.0 - u - v, u, v], axis=1)[..., None]).sum(axis=1)
+
+
+def random_points(faces: np.ndarray, each: int, seed: int = 0):
+    """Return random points of faces: face, u and v of each."""
+    rng = np.random.default_rng(seed)
+    u, v = rng.random((2, len(faces) * each))
+    fold = u + v > 1.0
+    u, v = np.where(fold, 1.0 - u, u), np.where(fold, 1.0 - v, v)
+    return np.repeat(faces, each), u, v
+
+
+def texel_sizes(scene: Scene, atlas: Atlas) -> np.ndarray:
+    """Return the length in metres of a texel on each face along its longest direction, float64 [face]; 0 off pages."""
+    points = scene._flat.points[scene._flat.indices].astype(np.float64)
+    sides, flat = points[:, 1:] - points[:, :1], (atlas.corners[:, 1:] - atlas.corners[:, :1]).astype(np.float64)
+    sizes = np.zeros(len(points))
+    good = np.abs(np.linalg.det(flat)) > 1e-9
+    sizes[good] = np.linalg.norm(np.linalg.inv(flat[good]) @ sides[good], axis=(1, 2), ord=2)
+    return sizes

@@ -1,0 +1,130 @@
+"""The program that cuts meshes into charts and packs them by xatlas, in a process of its own that can be stopped.
+
+It is run by its path with a folder, and imports nothing of this package. It reads ``job.npz`` there, writes
+``result.npz``, and prints the share of its work that is done, a line each. Arrays are those of ``charts.cut`` and
+``charts.pack``.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import xatlas
+
+CUT_TEXELS = 4.0
+"""Texels a triangle, along a side, of the page on which xatlas lays out the charts of one part. Their size is that of
+``charts.metric`` afterwards."""
+PADDING = 2
+"""Texels between charts, beyond those that a bilinear fetch touches."""
+NEAR = 0.97
+"""Share of the wanted size that a page has to reach."""
+MOST_PACKS = 10
+"""Largest number of times that charts are packed to meet the wanted size."""
+
+
+def cut(points: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return uv [triangle, 3, 2] in texels of some page, and the chart of each triangle, int32, -1 without one.
+
+    ``points`` float32 [vertex, 3] are scaled so that the triangles' area is about 1.
+    """
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(points, indices)
+    pack = xatlas.PackOptions()
+    pack.texels_per_unit = float(np.clip(CUT_TEXELS * np.sqrt(len(indices)), 64.0, 2048.0))
+    pack.rotate_charts_to_axis = True
+    atlas.generate(xatlas.ChartOptions(), pack)
+    if atlas.chart_count == 0:
+        return np.zeros((len(indices), 3, 2), np.float32), np.full(len(indices), -1, np.int32)
+    _, corners, uvs = atlas.get_mesh(0)
+    chart_of_vertex = atlas.get_mesh_vertex_assignment(0)[1].astype(np.int32)
+    size = np.array([atlas.width, atlas.height], np.float32)
+    return uvs[corners] * size, chart_of_vertex[corners[:, 0]]
+
+
+def pack(uvs: np.ndarray, charts: np.ndarray, size: int, tell: Callable[[float], None]) -> dict[str, np.ndarray]:
+    """Return charts with ``uvs`` [triangle, 3, 2] placed side by side on a page whose longer side is near ``size``.
+
+    ``corners`` float32 [triangle, 3, 2] are in texels; ``page`` int32 [2] is the width and height, or empty if the
+    charts do not fit, however small; ``scale`` float64 [1] is the number of texels along a unit of ``uvs``.
+    """
+    edges = uvs[:, 1:] - uvs[:, :1]
+    area = float(0.5 * np.abs(np.linalg.det(edges.astype(np.float64))).sum())
+    scale = size * np.sqrt(0.5 / max(area, 1e-30))
+    low, high, best = 0.0, np.inf, None
+    for attempt in range(MOST_PACKS):
+        corners, page = _packed(uvs, charts, scale)
+        got = max(page)
+        if got <= size:
+            if scale > low:
+                low, best = scale, (corners, page)
+            if got >= NEAR * size:
+                break
+        else:
+            high = min(high, scale)
+        wanted = scale * size / got * 0.99
+        inside = low < wanted < high
+        scale = wanted if inside else (low + min(high, 4.0 * low)) / 2.0 if low > 0.0 else scale / 2.0
+        tell((attempt + 1) / MOST_PACKS)
+    if best is None:
+        return {"corners": np.zeros_like(uvs), "page": np.zeros(0, np.int32), "scale": np.zeros(1)}
+    return {"corners": best[0], "page": np.array(best[1], np.int32), "scale": np.array([low])}
+
+
+def _packed(uvs: np.ndarray, charts: np.ndarray, scale: float) -> tuple[np.ndarray, tuple[int, int]]:
+    atlas = xatlas.Atlas()
+    points, corners = _welded(uvs, charts)
+    atlas.add_uv_mesh(points, corners, charts.astype(np.uint32).reshape(-1, 1))
+    options = xatlas.PackOptions()
+    options.padding, options.bilinear, options.texels_per_unit = PADDING, True, float(scale)
+    atlas.generate(xatlas.ChartOptions(), options)
+    _, corners, packed = atlas.get_mesh(0)
+    return packed[corners] * np.array([atlas.width, atlas.height], np.float32), (atlas.width, atlas.height)
+
+
+def _welded(uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the different places of corners in each chart, float32 [n, 2], and those of each triangle."""
+    keys = np.empty(3 * len(uvs), dtype=[("chart", np.int32), ("uv", np.float32, 2)])
+    keys["chart"], keys["uv"] = np.repeat(charts, 3), uvs.reshape(-1, 2)
+    order = np.lexsort((keys["uv"][:, 1], keys["uv"][:, 0], keys["chart"]))
+    ranked = keys[order]
+    is_new = np.append(True, ranked[1:] != ranked[:-1])
+    places = np.empty(len(keys), np.uint32)
+    places[order] = np.cumsum(is_new) - 1
+    return np.ascontiguousarray(ranked["uv"][is_new]), places.reshape(-1, 3)
+
+
+def run(job: Mapping[str, np.ndarray], tell: Callable[[float], None]) -> dict[str, np.ndarray]:
+    """Return what a job asks for: the charts of each part, or all charts on a page."""
+    if "size" in job:
+        return pack(job["uvs"], job["charts"], int(job["size"]), tell)
+    starts, vertex_starts = job["starts"], job["vertex_starts"]
+    points, indices = job["points"], job["indices"]
+    uvs, charts, count = [], [], 0
+    for part in range(len(starts) - 1):
+        vertices = slice(vertex_starts[part], vertex_starts[part + 1])
+        part_uvs, part_charts = cut(points[vertices], indices[starts[part] : starts[part + 1]])
+        uvs.append(part_uvs)
+        charts.append(np.where(part_charts >= 0, part_charts + count, -1).astype(np.int32))
+        count += part_charts.max(initial=-1) + 1
+        tell(float(starts[part + 1] / starts[-1]))
+    return {"uvs": np.concatenate(uvs), "charts": np.concatenate(charts)}
+
+
+def main(folder: Path, seconds: float) -> None:
+    """Work off the job in a folder; the system ends the process by SIGPROF after ``seconds`` of CPU time, if above 0."""
+    if seconds > 0.0 and hasattr(signal, "setitimer"):
+        signal.signal(signal.SIGPROF, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_PROF, seconds)
+    with np.load(folder / "job.npz") as job:
+        result = run(dict(job), lambda share: print(share, flush=True))
+    result["seconds"] = np.array(time.process_time())
+    np.savez(folder / "result.npz", **result)  # type: ignore[arg-type]
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), float(sys.argv[2]))

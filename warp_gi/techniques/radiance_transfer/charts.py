@@ -1,0 +1,186 @@
+"""Charts of a scene's surfaces: cut by xatlas or taken from meshes, and placed side by side on one page."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from warp_gi.errors import OptionError
+
+Progress = Callable[[float], None]
+"""Called with the share of the work that is done."""
+
+
+@dataclass(frozen=True, eq=False)
+class Page:
+    """Charts side by side."""
+
+    corners: np.ndarray
+    """Corners of faces in texels, float32 [face, 3, 2]."""
+    charts: np.ndarray
+    """Chart of each face, int32 [face]."""
+    width: int
+    """Texels along x."""
+    height: int
+    """Texels along y."""
+
+
+class ChartJob:
+    """Runs ``chart_worker.py`` with what is left of a limit of CPU seconds; 0 is no limit."""
+
+    def __init__(self, seconds: float) -> None:
+        self.limit = seconds
+        self.used = 0.0
+        """CPU seconds that the worker has used so far."""
+
+    def run(self, job: dict[str, np.ndarray], progress: Progress | None = None) -> dict[str, np.ndarray]:
+        """Return the worker's result; raises OptionError when the limit is over."""
+        worker = Path(__file__).with_name("chart_worker.py")
+        left = max(self.limit - self.used, 1e-3) if self.limit > 0.0 else 0.0
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+        with tempfile.TemporaryDirectory(prefix="warp_gi_charts_") as name:
+            folder = Path(name)
+            np.savez(folder / "job.npz", **job)  # type: ignore[arg-type]
+            command = [sys.executable, "-s", str(worker), name, repr(left)]
+            with subprocess.Popen(
+                command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            ) as process:
+                complaints: list[str] = []
+                listener = threading.Thread(target=lambda: complaints.extend(process.stderr or ()), daemon=True)
+                listener.start()
+                timer = None
+                if left > 0.0 and not hasattr(signal, "setitimer"):  # no CPU time limits there: by the clock
+                    timer = threading.Timer(left, process.kill)
+                    timer.start()
+                try:
+                    for line in process.stdout or ():
+                        if progress is not None:
+                            progress(float(line))
+                    code = process.wait()
+                except BaseException:
+                    process.kill()
+                    raise
+                finally:
+                    if timer is not None:
+                        timer.cancel()
+                    listener.join()
+            if code == 0:
+                with np.load(folder / "result.npz") as result:
+                    arrays = dict(result)
+                self.used += float(arrays.pop("seconds"))
+                return arrays
+        ended_by_limit = left > 0.0 and (timer is not None or code == -getattr(signal, "SIGPROF", 0))
+        if ended_by_limit:
+            raise OptionError(
+                f"xatlas took longer than chart_seconds={self.limit:g} to make charts; give chart_seconds more or 0 (no"
+                ' limit), take the meshes\' own uv (charts="own"), or keep transfer at vertices (storage="vertices")'
+            )
+        reason = complaints[-1].strip() if complaints else f"exit code {code}"
+        raise OptionError(f"making charts by xatlas failed ({reason}); take charts='own' or storage='vertices'")
+
+
+def surface_scales(points: np.ndarray, uvs: np.ndarray, charts: np.ndarray) -> np.ndarray:
+    """Return by how much to stretch each chart along u and v so that it is as large as its surface, float64 [chart, 2].
+
+    ``points`` [face, 3, 3] and ``uvs`` [face, 3, 2] are corners; 0, 0 for charts without area in uv. xatlas rounds the
+    size of charts up to whole texels, each axis apart; the metric tensor, a mean over the faces, tells both factors.
+    """
+    count = int(charts.max(initial=-1)) + 1
+    sides = (points[:, 1:] - points[:, :1]).astype(np.float64)
+    flat = (uvs[:, 1:] - uvs[:, :1]).astype(np.float64)
+    area = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    determinant = flat[:, 0, 0] * flat[:, 1, 1] - flat[:, 0, 1] * flat[:, 1, 0]
+    longest = (flat**2).sum(axis=2).max(axis=1)
+    good = (charts >= 0) & (np.abs(determinant) > 1e-5 * longest) & (longest > 0.0) & (area > 0.0)
+    charts, sides, flat, area = charts[good], sides[good], flat[good], area[good]
+    inverse = np.linalg.inv(flat)
+    jacobian = inverse @ sides
+    tensor = (jacobian**2).sum(axis=2)
+    weight = np.bincount(charts, area, count)
+    scales = np.stack([np.bincount(charts, area * tensor[:, axis], count) for axis in range(2)], axis=1)
+    scales = np.sqrt(np.divide(scales, weight[:, None], out=np.zeros_like(scales), where=weight[:, None] > 0.0))
+    flat_area = np.bincount(charts, 0.5 * np.abs(determinant[good]), count) * scales.prod(axis=1)
+    scales *= np.sqrt(np.divide(weight, flat_area, out=np.zeros_like(weight), where=flat_area > 0.0))[:, None]
+    return scales
+
+
+def plane_uvs(points: np.ndarray) -> np.ndarray:
+    """Return triangles [face, 3, 3] laid flat, float32 [face, 3, 2]: the first corner at 0, the second on the x axis."""
+    sides = (points[:, 1:] - points[:, :1]).astype(np.float64)
+    length = np.linalg.norm(sides[:, 0], axis=1)
+    along = (sides[:, 0] * sides[:, 1]).sum(axis=1) / length
+    across = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / length
+    uvs = np.zeros((len(points), 3, 2), np.float32)
+    uvs[:, 1, 0], uvs[:, 2, 0], uvs[:, 2, 1] = length, along, across
+    return uvs
+
+
+def cut_charts(
+    points: np.ndarray, parts: np.ndarray, job: ChartJob, progress: Progress | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return uv [face, 3, 2] and chart of each face, int32 [face], by xatlas; no chart is of two parts.
+
+    ``points`` float64 [face, 3, 3] are corners of faces that have an area, in any unit; ``parts`` are their parts,
+    rising from 0 without a gap.
+    """
+    starts = np.searchsorted(parts, np.arange(parts[-1] + 2)) if len(parts) else np.zeros(1, np.int64)
+    all_points, all_indices, vertex_starts = [], [], [0]
+    for begin, end in zip(starts[:-1], starts[1:], strict=True):
+        corners = points[begin:end].reshape(-1, 3)
+        sides = points[begin:end, 1:] - points[begin:end, :1]
+        size = np.sqrt(0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum())
+        places = ((corners - corners.min(axis=0)) / size).astype(np.float32)
+        vertices, indices = np.unique(places, axis=0, return_inverse=True)
+        all_points.append(vertices)
+        all_indices.append(indices.reshape(-1, 3).astype(np.uint32))
+        vertex_starts.append(vertex_starts[-1] + len(vertices))
+    if not all_points:
+        return np.zeros((0, 3, 2), np.float32), np.zeros(0, np.int32)
+    result = job.run(
+        {
+            "points": np.concatenate(all_points),
+            "indices": np.concatenate(all_indices),
+            "starts": starts,
+            "vertex_starts": np.array(vertex_starts),
+        },
+        progress,
+    )
+    return result["uvs"], result["charts"]
+
+
+def surface_sized(points: np.ndarray, uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return uv as large as the surface, and charts: faces of a chart without area in uv get one each."""
+    scales = surface_scales(points, uvs, charts)
+    is_flat = charts < 0
+    is_flat[~is_flat] = (scales[charts[~is_flat]] == 0.0).any(axis=1)
+    sized, numbers = np.empty_like(uvs, dtype=np.float32), charts.copy()
+    rest = ~is_flat
+    sized[rest] = uvs[rest] * scales[charts[rest]][:, None]
+    sized[is_flat] = plane_uvs(points[is_flat])
+    numbers[is_flat] = int(charts.max(initial=-1)) + 1 + np.arange(np.count_nonzero(is_flat))
+    return sized, np.unique(numbers, return_inverse=True)[1].astype(np.int32)
+
+
+def packed(uvs: np.ndarray, charts: np.ndarray, size: int, job: ChartJob, progress: Progress | None) -> Page:
+    """Return the charts side by side on a page of at most ``size`` texels a side, and close to it.
+
+    Raises OptionError if they do not fit.
+    """
+    count = int(charts.max(initial=-1)) + 1
+    result = job.run({"uvs": uvs, "charts": charts, "size": np.array(size)}, progress)
+    if len(result["page"]) == 0:
+        raise OptionError(
+            f"resolution {size} is too small for the {count:,} charts of this scene; take a larger resolution, or keep"
+            ' transfer at vertices (storage="vertices")'
+        )
+    width, height = (int(n) for n in result["page"])
+    return Page(result["corners"], charts, width, height)

@@ -1,0 +1,92 @@
+"""The present sky as transfer textures need it: few numbers, a matrix for lobes, and suns apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+import warp as wp
+
+from warp_gi.kernels.transfer_light import TransferSky
+from warp_gi.kernels.transfer_native import LIGHT_WIDTH, WIDTHS
+from warp_gi.launch import on_device
+from warp_gi.stateful import Ahead, Service
+from warp_gi.techniques.radiance_transfer import products
+from warp_gi.techniques.radiance_transfer.settings import LIGHT_ORDER, TransferSettings
+
+if TYPE_CHECKING:
+    from warp_gi.baking import Bake
+    from warp_gi.frame import Frame
+    from warp_gi.scene.baked import BakedScene
+    from warp_gi.scene.environment import Environment
+    from warp_gi.scene.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class SkyLight:
+    """A sky on a device, ready for this frame's kernels."""
+
+    appearance: tuple[object, ...] | None
+    """What decides it: two skies with equal values look the same."""
+    sky: TransferSky
+    """The sky as kernels read it."""
+
+
+@dataclass(frozen=True)
+class TransferLight(Service):
+    """Turns the present sky into what transfer is multiplied by: once a frame, for both terms.
+
+    Two estimators that ask for it with different settings cannot share a bake; the pipeline says so.
+    """
+
+    name: ClassVar[str] = "transfer_light"
+
+    bake_settings_of: TransferSettings
+    """Settings of the bake that it is the light of."""
+    sun: float
+    """Radiance, in means of the sky, above which light is a sun's and gets a shadow ray; 0 keeps all in the sky."""
+    window: float
+    """Strength of the window on the light of glossy lobes."""
+
+    def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> None:
+        """Return None: what it makes of a sky follows from that sky alone."""
+        return None
+
+    def bake_key(self, scene: Scene | BakedScene) -> str:
+        """Return what never changes: the sky is looked at in every frame."""
+        return "sky of each frame"
+
+    def preprocess(self, frame: Frame, state: SkyLight | None) -> SkyLight:
+        """Offer a ``SkyLight`` for the frame's sky."""
+        environment = getattr(frame.scene, "environment", None)
+        appearance = None if environment is None else environment.appearance
+        if state is None or state.appearance != appearance:
+            state = SkyLight(appearance, self._on_device(environment, frame.device))
+        frame.offer(state)
+        return state
+
+    def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
+        """Return False: it is made of the frame's own sky."""
+        return False
+
+    def _on_device(self, environment: Environment | None, device: wp.Device) -> TransferSky:
+        order = self.bake_settings_of.order
+        whole = np.zeros((3, LIGHT_ORDER**2)) if environment is None else environment.harmonics_of(LIGHT_ORDER)
+        light = whole
+        count, width = order * order, WIDTHS[order]
+        windowed = light * np.repeat(products.window(LIGHT_ORDER, self.window), 2 * np.arange(LIGHT_ORDER) + 1)
+        matrix = np.zeros((count, 3, width), np.float32)
+        matrix[:, :, :count] = products.light_matrix(windowed, order).transpose(1, 0, 2)
+        result = TransferSky()
+        result.light = on_device(_padded(light, width), wp.float32, device)
+        result.whole_light = on_device(_padded(whole, LIGHT_WIDTH), wp.float32, device)
+        result.matrix = on_device(matrix.reshape(-1), wp.float32, device)
+        return result
+
+
+def _padded(light: np.ndarray, width: int) -> np.ndarray:
+    """Return coefficients [3, n] as float32 [3 * width], zeros behind."""
+    rows = np.zeros((3, width), np.float32)
+    rows[:, : light.shape[1]] = light
+    return rows.reshape(-1)

@@ -1,0 +1,61 @@
+"""Transfer textures on a device."""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_gi.baking import Bake
+from warp_gi.kernels.transfer_light import TransferRows
+from warp_gi.kernels.transfer_native import LIGHT_WIDTH, WIDTHS
+from warp_gi.launch import get_device, on_device
+from warp_gi.techniques.radiance_transfer.textures import transfer_textures
+
+LINE = 64
+"""Bytes of a cache line."""
+
+
+@dataclass(frozen=True, eq=False)
+class TransferState:
+    """A bake as kernels read it. It stays as it is over a sequence: the sky is apart."""
+
+    rows: TransferRows
+    """Atlas and rows."""
+    order: int
+    """Order of the harmonics of transfer."""
+
+
+_states: weakref.WeakKeyDictionary[Bake, dict[str, TransferState]] = weakref.WeakKeyDictionary()
+
+
+def transfer_state(bake: Bake, device: str) -> TransferState:
+    """Return a bake on a device; made once, for all terms that share it. Raises BakeError for another technique's."""
+    known = _states.setdefault(bake, {})
+    if device not in known:
+        known[device] = _made(bake, get_device(device))
+    return known[device]
+
+
+def _made(bake: Bake, device: wp.Device) -> TransferState:
+    textures = transfer_textures(bake)
+    order = round(textures.transfer.shape[1] ** 0.5)
+    rows = TransferRows()
+    rows.atlas, rows.width = textures.atlas.on(device), WIDTHS[order]
+    rows.transfer = on_device(_padded(textures.transfer, rows.width).reshape(-1), wp.float16, device)
+    rows.bounces = on_device(_padded(textures.bounces, LIGHT_WIDTH).reshape(-1), wp.float16, device)
+    rows.lamps = on_device(textures.lamps, wp.vec3, device)
+    return TransferState(rows, order)
+
+
+def _padded(values: np.ndarray, width: int) -> np.ndarray:
+    """Return ``values`` with zeros behind the last axis up to ``width``; rows of 64 bytes start at cache lines."""
+    shape = (*values.shape[:-1], width)
+    size = int(np.prod(shape)) * values.itemsize
+    room = np.zeros(size + LINE, np.uint8)
+    start = -room.ctypes.data % LINE
+    result = room[start : start + size].view(values.dtype).reshape(shape)
+    result[..., : values.shape[-1]] = values
+    return result
