@@ -1,23 +1,25 @@
 """Light at a point from transfer textures: of the sky directly, over other surfaces, and of suns by a shadow ray each.
 
 Diffuse light is exact for a sky of 25 numbers a channel: T has the cosine in it, so a Lambert surface reflects
-albedo / pi times the sum of L_j T_j. Glossy lobes are zonal about a fitted direction (transfer_lobes.py).
+albedo / pi times the sum of L_j T_j. Glossy lobes F are zonal about a fitted direction (transfer_lobes.py); what they
+reflect is the sum of F_k M_kj T_j with the sky's matrix M (TPFL of the paper).
 """
 
 import warp as wp
 
-from warp_gi.kernels.bsdf import average_reflectance, average_specular, bsdf_evaluate, diffuse_share
+from warp_gi.kernels.bsdf import Bsdf, average_reflectance, bsdf_evaluate, diffuse_share
 from warp_gi.kernels.bvh import BvhHit, bvh_occluded
 from warp_gi.kernels.path_samplers import KnownRadiance, PathCache
 from warp_gi.kernels.surface import Surface, ray_origin, shading_normal
 from warp_gi.kernels.transfer_atlas import SlotFetch, TransferAtlas, atlas_fetch, side_seen
-from warp_gi.kernels.transfer_native import bounced_product, environment_product
-from warp_gi.kernels.types import SceneData
+from warp_gi.kernels.transfer_lobes import LobeTable, lobe_at
+from warp_gi.kernels.transfer_products import bounced_product, environment_product, glossy_product
+from warp_gi.kernels.types import Environment, SceneData
 
 wp.set_module_options({"enable_backward": False})
 
 
-# What a bake holds, and where it is kept. Rows are padded (transfer_native.py).
+# What a bake holds, and where it is kept. Rows are padded (transfer_products.py).
 @wp.struct
 class TransferRows:
     atlas: TransferAtlas
@@ -33,6 +35,8 @@ class TransferSky:
     light: wp.array(dtype=wp.float32)  # [3, width] without suns: direct light
     whole_light: wp.array(dtype=wp.float32)  # [3, 32] with suns: light over other surfaces
     matrix: wp.array(dtype=wp.float32)  # [order^2, 3, width] of light without suns: sum_i C_ijk L_i, for lobes
+    lobes: LobeTable
+    rest: Environment  # the sky without suns, for rays of sharp lobes
     sun_count: wp.int32
     sun_directions: wp.array(dtype=wp.vec3)
     sun_irradiances: wp.array(dtype=wp.vec3)  # W/m^2 perpendicular to the direction
@@ -40,7 +44,9 @@ class TransferSky:
 
 # Where transfer of the point of a hit is kept, seen from the side of `s.normal`.
 @wp.func
-def surface_slots(rows: TransferRows, scene: SceneData, s: Surface, face: wp.int32, u: wp.float32, v: wp.float32) -> SlotFetch:
+def surface_slots(
+    rows: TransferRows, scene: SceneData, s: Surface, face: wp.int32, u: wp.float32, v: wp.float32
+) -> SlotFetch:
     return atlas_fetch(rows.atlas, face, u, v, side_seen(scene, face, -s.normal))
 
 
@@ -56,14 +62,14 @@ def bounced_irradiance(rows: TransferRows, sky: TransferSky, at: SlotFetch) -> w
     return light
 
 
-# Radiance of the suns that a surface reflects towards wo, which is in the frame of its shading.
+# Radiance of the suns that a BSDF at a surface reflects towards wo, which is in the frame of its shading.
 @wp.func
-def sun_radiance(scene: SceneData, sky: TransferSky, s: Surface, wo: wp.vec3) -> wp.vec3:
+def sun_radiance(scene: SceneData, sky: TransferSky, s: Surface, b: Bsdf, wo: wp.vec3) -> wp.vec3:
     sum = wp.vec3(0.0, 0.0, 0.0)
     for k in range(sky.sun_count):
         direction = sky.sun_directions[k]
         if wp.dot(direction, s.normal) > 0.0:
-            f = bsdf_evaluate(s.bsdf, wo, wp.transpose(s.shading) * direction)
+            f = bsdf_evaluate(b, wo, wp.transpose(s.shading) * direction)
             if wp.max(f.value) > 0.0 and not bvh_occluded(scene.bvh, ray_origin(s), direction, float(wp.inf)):
                 sum = sum + wp.cw_mul(f.value, sky.sun_irradiances[k])
     return sum
@@ -74,6 +80,24 @@ def sun_radiance(scene: SceneData, sky: TransferSky, s: Surface, wo: wp.vec3) ->
 def diffuse_radiance(rows: TransferRows, sky: TransferSky, s: Surface, at: SlotFetch) -> wp.vec3:
     irradiance = environment_product(rows.transfer, rows.width, at.slots, at.shares, sky.light)
     return wp.cw_mul(wp.cw_mul(diffuse_share(s.bsdf), s.bsdf.diffuse), irradiance) / wp.pi
+
+
+# Radiance of the sky, without suns, that the glossy lobe reflects towards the unit direction `view`.
+@wp.func
+def glossy_radiance(rows: TransferRows, sky: TransferSky, s: Surface, at: SlotFetch, view: wp.vec3) -> wp.vec3:
+    normal = shading_normal(s)
+    lobe = lobe_at(sky.lobes, wp.sqrt(s.bsdf.alpha), normal, view)
+    light = glossy_product(
+        rows.transfer, rows.width, at.slots, at.shares, sky.matrix, lobe.direction, lobe.factors, normal
+    )
+    reflected = s.bsdf.f0 * lobe.scale + wp.vec3(1.0, 1.0, 1.0) * (s.bsdf.f90 * lobe.offset)
+    return wp.cw_mul(reflected, wp.vec3(light[0], light[1], light[2]))
+
+
+# Whether transfer is kept around a point.
+@wp.func
+def is_kept(at: SlotFetch) -> wp.bool:
+    return at.shares[0] + at.shares[1] + at.shares[2] + at.shares[3] > 0.0
 
 
 # A radiance cache of what transfer textures know, which all of a path may end in.
@@ -87,7 +111,7 @@ class TransferCache:
 def transfer_lookup(data: TransferCache, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit) -> KnownRadiance:
     at = surface_slots(data.rows, scene, s, hit.face, hit.u, hit.v)
     known = KnownRadiance()
-    if at.shares[0] + at.shares[1] + at.shares[2] + at.shares[3] > 0.0:
+    if is_kept(at):
         irradiance = bounced_irradiance(data.rows, data.sky, at)
         known.radiance = wp.cw_mul(average_reflectance(s.bsdf), irradiance) / wp.pi
         known.validity = 1.0

@@ -4,12 +4,15 @@ import warp as wp
 
 from warp_gi.kernels.bsdf import average_reflectance
 from warp_gi.kernels.gbuffer import PassSettings, PrimaryHits, tiled_pixel
-from warp_gi.kernels.surface import surface_at
+from warp_gi.kernels.surface import Surface, surface_at
+from warp_gi.kernels.transfer_atlas import SlotFetch
 from warp_gi.kernels.transfer_light import (
     TransferRows,
     TransferSky,
     bounced_irradiance,
     diffuse_radiance,
+    glossy_radiance,
+    is_kept,
     sun_radiance,
     surface_slots,
 )
@@ -25,6 +28,8 @@ WANTS_INDIRECT = wp.constant(2)
 @wp.struct
 class TransferQuery:
     terms: wp.int32  # WANTS_*
+    traced_below: wp.float32  # roughness below which rays are traced for the glossy lobe
+    traces: wp.int32  # 1: a launch of transfer_trace.py serves these pixels, and those where no transfer is kept
 
 
 # Sums over samples, [height * width], of each term, of its samples and of their squares.
@@ -38,6 +43,12 @@ class TransferBuffers:
     indirect: wp.array(dtype=wp.vec3)
     indirect_moment1: wp.array(dtype=wp.vec3)
     indirect_moment2: wp.array(dtype=wp.vec3)
+
+
+# Whether rays are traced for the light of a surface.
+@wp.func
+def is_traced(query: TransferQuery, s: Surface, at: SlotFetch) -> wp.bool:
+    return not is_kept(at) or (s.bsdf.f90 > 0.0 and wp.sqrt(s.bsdf.alpha) < query.traced_below)
 
 
 # Adds radiance that stands for `count` equal samples.
@@ -78,11 +89,16 @@ def shade_transfer(
     direction = hits.direction[pixel]
     s = surface_at(scene, face, hits.u[pixel], hits.v[pixel], -direction)
     at = surface_slots(rows, scene, s, face, hits.u[pixel], hits.v[pixel])
+    if query.traces != 0 and is_traced(query, s, at):
+        return
     count = wp.float32(settings.sample_count)
     if (query.terms & WANTS_ENVIRONMENT) != 0:
-        light = wp.max(diffuse_radiance(rows, sky, s, at), wp.vec3(0.0, 0.0, 0.0))
+        light = diffuse_radiance(rows, sky, s, at)
+        if s.bsdf.f90 > 0.0:
+            light = light + glossy_radiance(rows, sky, s, at, -direction)
+        light = wp.max(light, wp.vec3(0.0, 0.0, 0.0))
         if sky.sun_count > 0:
-            light = light + sun_radiance(scene, sky, s, wp.transpose(s.shading) * -direction)
+            light = light + sun_radiance(scene, sky, s, s.bsdf, wp.transpose(s.shading) * -direction)
         b = buffers
         add_equal(b.environment, b.environment_moment1, b.environment_moment2, pixel, light, count)
     if (query.terms & WANTS_INDIRECT) != 0:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Literal
 
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.estimator import Estimator
-from warp_gi.kernels import transfer_light, transfer_shade
-from warp_gi.kernels.transfer_native import ORDERS
+from warp_gi.kernels import path_trace, transfer_light, transfer_shade
+from warp_gi.kernels.transfer_products import ORDERS
 from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import whole_scene
 from warp_gi.stateful import Ahead, Service
@@ -31,6 +31,8 @@ TERM_BITS = {
     "indirect": int(transfer_shade.WANTS_INDIRECT),
 }
 """Terms that transfer textures know."""
+MOST_EDGES, ROULETTE_EDGES = 64, 5
+"""Edges of the longest path from what moves, and number of edges from which on paths end at random."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,11 @@ class RadianceTransfer(Estimator, RadianceCache):
     sun: float = 20.0
     """Radiance, in means of the sky, above which light is a sun's: it leaves the harmonics of direct light and gets a
     shadow ray. 0 keeps all light in the harmonics."""
+    glossy: Literal["auto", "transfer", "traced"] = "auto"
+    """How glossy lobes are lit: "auto" by transfer down to a roughness of ``traced_below`` and by rays below it,
+    "transfer" by transfer alone, as in the paper, "traced" by rays alone."""
+    traced_below: float = 0.45
+    """Roughness below which rays are traced for the glossy lobe, one for each of the pipeline's samples."""
     window: float = 0.005
     """Strength of the window on the light of glossy lobes, against ringing: bands l are divided by
     1 + window l^2 (l + 1)^2."""
@@ -84,6 +91,7 @@ class RadianceTransfer(Estimator, RadianceCache):
             ("term", self.term, tuple(TERM_BITS)),
             ("storage", self.storage, ("texture", "vertices")),
             ("charts", self.charts, ("auto", "xatlas", "own")),
+            ("glossy", self.glossy, ("auto", "transfer", "traced")),
         )
         for name, value, known in choices:
             if value not in known:
@@ -102,7 +110,7 @@ class RadianceTransfer(Estimator, RadianceCache):
                 raise OptionError(f"{name} must be a whole number from {low} to {high}, got {value!r}")
         if self.rays < self.first_rays:
             raise OptionError(f"rays must be at least first_rays ({self.first_rays}), got {self.rays}")
-        for name in ("chart_seconds", "tolerance", "sun", "window"):
+        for name in ("chart_seconds", "tolerance", "sun", "traced_below", "window"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise OptionError(f"{name} must be finite and not negative, got {value}")
@@ -121,7 +129,7 @@ class RadianceTransfer(Estimator, RadianceCache):
 
     def bake_key(self, scene: Scene | BakedScene) -> str:
         """Return a hash of all that the bake depends on: not of the sky."""
-        return transfer_key(whole_scene(scene))
+        return transfer_key(whole_scene(scene), self.bounces > 0)
 
     def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Setting]:
         """Return the settings that the bake depends on."""
@@ -138,9 +146,7 @@ class RadianceTransfer(Estimator, RadianceCache):
         """Return transfer textures of the scene at time 0. Raises OptionError, SceneError or BakeError."""
         return bake_transfer(scene, self.transfer_settings, device, seed, progress)
 
-    def start(
-        self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0
-    ) -> TransferState:
+    def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> TransferState:
         """Return the bake on the device; terms that share it share its memory."""
         return transfer_state(bake or self.bake(whole_scene(scene), device, seed), device)
 
@@ -158,9 +164,7 @@ class RadianceTransfer(Estimator, RadianceCache):
 
     def give(self, frame: Frame, state: TransferState) -> None:
         """Let paths end in what is known of light that was reflected before."""
-        cache = transfer_light.TransferCache()
-        cache.rows, cache.sky = state.rows, self._sky(frame)
-        frame.paths.use_cache(transfer_light.TRANSFER_CACHE, cache)
+        frame.paths.use_cache(transfer_light.TRANSFER_CACHE, transfer_cache(state, self._sky(frame)))
 
     def trace(self, frame: Frame, state: TransferState) -> None:
         """Add the light of the current camera sample, of all terms with these settings at once."""
@@ -170,19 +174,58 @@ class RadianceTransfer(Estimator, RadianceCache):
             return  # the first of them did it
         query, buffers = transfer_shade.TransferQuery(), transfer_shade.TransferBuffers()
         buffers.width, buffers.height = frame.camera.resolution
+        query.terms = sum(TERM_BITS[one.term] for one in alike)
         for one in alike:
-            query.terms |= TERM_BITS[one.term]
             setattr(buffers, one.term, frame[one.term])
             for order, moment in enumerate(frame.moments(one.term), 1):
                 setattr(buffers, f"{one.term}_moment{order}", moment)
-        inputs = [frame.data, frame.pass_settings, state.rows, self._sky(frame), query, frame.hits, buffers]
+        query.traced_below = {"transfer": 0.0, "traced": 2.0}.get(self.glossy, self.traced_below)
+        query.traces = int(_needs_rays(frame.scene, query.traced_below))
+        sky = self._sky(frame)
+        inputs = [frame.data, frame.pass_settings, state.rows, sky, query, frame.hits, buffers]
         frame.launch_tiled(transfer_shade.shade_transfer, inputs)
+        if query.traces:
+            self._trace_rays(frame, transfer_cache(state, sky), query, buffers)
+
+    def _trace_rays(
+        self,
+        frame: Frame,
+        cache: transfer_light.TransferCache,
+        query: transfer_shade.TransferQuery,
+        buffers: transfer_shade.TransferBuffers,
+    ) -> None:
+        """Add the light of pixels that transfer does not serve."""
+        from warp_gi.kernels import transfer_trace  # it has a path tracer in it, which most scenes do without
+
+        samplers = transfer_trace.TransferSamplers()
+        samplers.cache = cache
+        paths = path_trace.PathSettings()
+        paths.terms = int(path_trace.TERM_ENVIRONMENT | path_trace.TERM_INDIRECT)
+        paths.max_depth, paths.roulette_depth = MOST_EDGES, ROULETTE_EDGES
+        paths.sky_probability, paths.spp = frame.sky_probability, frame.settings.spp
+        paths.cache_vertex = int(path_trace.CACHE_VERTEX)
+        inputs = [frame.data, frame.pass_settings, samplers, paths, query, frame.hits, buffers]
+        frame.launch_tiled(transfer_trace.trace_transfer, inputs)
 
     def _sky(self, frame: Frame) -> transfer_light.TransferSky:
         light = frame.offered(SkyLight)
         if light is None:
             raise OptionError("the service transfer_light has not seen this frame's sky: list it among the services")
         return light.sky
+
+
+def transfer_cache(state: TransferState, sky: transfer_light.TransferSky) -> transfer_light.TransferCache:
+    """Return textures and sky as paths read them."""
+    cache = transfer_light.TransferCache()
+    cache.rows, cache.sky = state.rows, sky
+    return cache
+
+
+def _needs_rays(scene: Scene | BakedScene, traced_below: float) -> bool:
+    """Return whether something moves, or a surface may be sharper than ``traced_below``."""
+    sharp = (one.roughness < traced_below or one.metallic_roughness_texture for one in whole_scene(scene).materials)
+    shiny = (one.specular > 0 or one.metallic > 0 for one in whole_scene(scene).materials)
+    return scene.is_animated or any(a and b for a, b in zip(sharp, shiny, strict=True))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,180 @@
+"""Light of pixels for which transfer textures are not enough: lobes too sharp for them, and surfaces without texels.
+
+What moves has no texels; its light is path traced, and paths end in the textures after one bounce. Of a sharp lobe
+rays are traced: what they meet is lit by the textures.
+"""
+
+import warp as wp
+
+from warp_gi.kernels.bsdf import average_reflectance, diffuse_share, lambert, specular_sample
+from warp_gi.kernels.bvh import BvhHit, bvh_intersect
+from warp_gi.kernels.environment import environment_radiance
+from warp_gi.kernels.gbuffer import PassSettings, PrimaryHits, tiled_pixel
+from warp_gi.kernels.path_samplers import ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY
+from warp_gi.kernels.path_trace import (
+    NO_PATH,
+    TERM_EMITTERS,
+    TERM_ENVIRONMENT,
+    TERM_INDIRECT,
+    PathSettings,
+    path_tracer,
+)
+from warp_gi.kernels.sampling import OWN_DIMENSION, pixel_sample_index, pixel_seed, sample_2d
+from warp_gi.kernels.surface import Surface, ray_origin, surface_at
+from warp_gi.kernels.transfer_atlas import SlotFetch
+from warp_gi.kernels.transfer_light import (
+    TRANSFER_CACHE,
+    TransferCache,
+    bounced_irradiance,
+    diffuse_radiance,
+    is_kept,
+    sun_radiance,
+    surface_slots,
+)
+from warp_gi.kernels.transfer_products import environment_product
+from warp_gi.kernels.transfer_shade import (
+    WANTS_ENVIRONMENT,
+    WANTS_INDIRECT,
+    TransferBuffers,
+    TransferQuery,
+    add_equal,
+    is_traced,
+)
+from warp_gi.kernels.types import SceneData
+
+wp.set_module_options({"enable_backward": False})
+
+TRACER = path_tracer(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY, TRANSFER_CACHE)
+TransferSamplers = TRACER.samplers
+trace_path = TRACER.trace_path
+NARROW = wp.constant(wp.float32(0.03))  # alpha below which a lobe's rays look for suns themselves: it is about as wide
+
+
+# Light of one sample.
+@wp.struct
+class TracedLight:
+    environment: wp.vec3
+    indirect: wp.vec3
+
+
+# Radiance that leaves what a ray meets: light of the sky and of lamps that was reflected there.
+@wp.func
+def leaving_radiance(
+    scene: SceneData,
+    samplers: TransferSamplers,
+    paths: PathSettings,
+    hit: BvhHit,
+    direction: wp.vec3,
+    index: wp.uint32,
+    seed: wp.uint32,
+) -> wp.vec3:
+    s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
+    wanted = paths
+    at = surface_slots(samplers.cache.rows, scene, s, hit.face, hit.u, hit.v)
+    if not is_kept(at):
+        wanted.terms = TERM_ENVIRONMENT | TERM_EMITTERS | TERM_INDIRECT
+        r = trace_path(scene, samplers, hit, s, -direction, wanted, index, seed, NO_PATH)
+        return r.environment + r.emitters + r.indirect
+    sky = samplers.cache.sky
+    rows = samplers.cache.rows
+    irradiance = wp.max(environment_product(rows.transfer, rows.width, at.slots, at.shares, sky.light), wp.vec3())
+    irradiance = irradiance + bounced_irradiance(rows, sky, at)
+    light = wp.cw_mul(average_reflectance(s.bsdf), irradiance) / wp.pi
+    if sky.sun_count > 0:
+        light = light + sun_radiance(scene, sky, s, lambert(average_reflectance(s.bsdf)), wp.vec3(0.0, 0.0, 1.0))
+    if scene.emitters.count > 0:
+        wanted.terms = TERM_EMITTERS
+        r = trace_path(scene, samplers, hit, s, -direction, wanted, index, seed, NO_PATH)
+        light = light + r.emitters
+    return light
+
+
+# What a ray of the glossy lobe brings.
+@wp.func
+def lobe_light(
+    scene: SceneData,
+    samplers: TransferSamplers,
+    paths: PathSettings,
+    s: Surface,
+    wo: wp.vec3,
+    index: wp.uint32,
+    seed: wp.uint32,
+) -> TracedLight:
+    r = TracedLight()
+    b = specular_sample(s.bsdf, wo, sample_2d(index, seed, OWN_DIMENSION))
+    if b.pdf <= 0.0:
+        return r
+    wi = s.shading * b.wi
+    if wp.dot(wi, s.normal) <= 0.0:
+        return r
+    hit = bvh_intersect(scene.bvh, ray_origin(s), wi, float(wp.inf))
+    if hit.face >= 0:
+        r.indirect = wp.cw_mul(b.weight, leaving_radiance(scene, samplers, paths, hit, wi, index, seed))
+    elif samplers.cache.sky.sun_count > 0 and s.bsdf.alpha >= NARROW:
+        r.environment = wp.cw_mul(b.weight, environment_radiance(samplers.cache.sky.rest, wi))
+    else:
+        r.environment = wp.cw_mul(b.weight, environment_radiance(scene.environment, wi))
+    return r
+
+
+# Light of a sharp surface that needs no ray of its lobe: of its diffuse lobe, and of suns.
+@wp.func
+def known_light(scene: SceneData, cache: TransferCache, s: Surface, at: SlotFetch, wo: wp.vec3) -> TracedLight:
+    r = TracedLight()
+    r.environment = wp.max(diffuse_radiance(cache.rows, cache.sky, s, at), wp.vec3(0.0, 0.0, 0.0))
+    diffuse = wp.cw_mul(diffuse_share(s.bsdf), s.bsdf.diffuse)
+    if cache.sky.sun_count > 0:
+        b = s.bsdf
+        if b.alpha < NARROW:
+            b = lambert(diffuse)
+        r.environment = r.environment + sun_radiance(scene, cache.sky, s, b, wo)
+    r.indirect = wp.cw_mul(diffuse, bounced_irradiance(cache.rows, cache.sky, at)) / wp.pi
+    return r
+
+
+# Thread: a pixel. Adds the samples of the current camera sample, where rays are traced.
+@wp.kernel
+def trace_transfer(
+    first: wp.int32,
+    scene: SceneData,
+    settings: PassSettings,
+    samplers: TransferSamplers,
+    paths: PathSettings,
+    query: TransferQuery,
+    hits: PrimaryHits,
+    buffers: TransferBuffers,
+):
+    p = tiled_pixel(first + wp.tid(), buffers.width)
+    if p[0] >= buffers.width or p[1] >= buffers.height:
+        return
+    pixel = p[1] * buffers.width + p[0]
+    hit = BvhHit()
+    hit.face = hits.face[pixel]
+    if hit.face < 0:
+        return
+    hit.u = hits.u[pixel]
+    hit.v = hits.v[pixel]
+    view = -hits.direction[pixel]
+    s = surface_at(scene, hit.face, hit.u, hit.v, view)
+    at = surface_slots(samplers.cache.rows, scene, s, hit.face, hit.u, hit.v)
+    if not is_traced(query, s, at):
+        return
+    wo = wp.transpose(s.shading) * view
+    known = known_light(scene, samplers.cache, s, at, wo)
+    seed = pixel_seed(p[0], p[1], settings.sample_bits, settings.seed)
+    for i in range(settings.sample_count):
+        index = pixel_sample_index(p[0], p[1], settings.first_sample + i, settings.sample_bits)
+        light = TracedLight()
+        if is_kept(at):
+            light = lobe_light(scene, samplers, paths, s, wo, index, seed)
+            light.environment = light.environment + known.environment
+            light.indirect = light.indirect + known.indirect
+        else:
+            path = trace_path(scene, samplers, hit, s, view, paths, index, seed, NO_PATH)
+            light.environment = path.environment
+            light.indirect = path.indirect
+        b = buffers
+        if (query.terms & WANTS_ENVIRONMENT) != 0:
+            add_equal(b.environment, b.environment_moment1, b.environment_moment2, pixel, light.environment, 1.0)
+        if (query.terms & WANTS_INDIRECT) != 0:
+            add_equal(b.indirect, b.indirect_moment1, b.indirect_moment2, pixel, light.indirect, 1.0)
