@@ -189,6 +189,8 @@ def split_parts(centers: np.ndarray, parts: np.ndarray) -> np.ndarray:
 
 def surface_sized(points: np.ndarray, uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return uv as large as the surface, and charts: faces of a chart without area in uv get one each."""
+    if len(points) == 0:
+        return uvs, charts
     scales = surface_scales(points, uvs, charts)
     is_flat = charts < 0
     is_flat[~is_flat] = (scales[charts[~is_flat]] == 0.0).any(axis=1)

@@ -98,9 +98,9 @@ def _is_inside(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
 def islands(points: np.ndarray, uvs: np.ndarray) -> np.ndarray:
     """Return the island of each face, int32 [face]: faces hang together where corners agree in place and in uv.
 
-    ``points`` [face, 3, 3] and ``uvs`` [face, 3, 2] are corners.
+    ``points`` [face, 3, n] and ``uvs`` [face, 3, 2] are corners; places may have more coordinates than three.
     """
-    keys = np.concatenate([points.reshape(-1, 3), uvs.reshape(-1, 2)], axis=1).astype(np.float32)
+    keys = np.concatenate([points.reshape(3 * len(points), -1), uvs.reshape(-1, 2)], axis=1).astype(np.float32)
     corners = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1, 3)
     labels = np.arange(corners.max(initial=-1) + 1)  # of corners: the lowest corner that each hangs together with
     while True:
