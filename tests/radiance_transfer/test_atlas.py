@@ -25,7 +25,6 @@ from warp_gi.techniques.radiance_transfer.atlas import make_atlas
 from warp_gi.techniques.radiance_transfer.densities import automatic_factors, density_factors, parse_texel_sets
 from warp_gi.techniques.radiance_transfer.textures import Atlas
 
-
 RUN = charts.ChartJob.run
 
 
