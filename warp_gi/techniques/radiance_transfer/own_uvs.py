@@ -93,22 +93,3 @@ def _is_inside(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     total = parts.sum(axis=0)
     shares = np.divide(parts, total, out=np.zeros_like(parts), where=total != 0.0)
     return (shares > MARGIN).all(axis=0)
-
-
-def islands(points: np.ndarray, uvs: np.ndarray) -> np.ndarray:
-    """Return the island of each face, int32 [face]: faces hang together where corners agree in place and in uv.
-
-    ``points`` [face, 3, n] and ``uvs`` [face, 3, 2] are corners; places may have more coordinates than three.
-    """
-    keys = np.concatenate([points.reshape(3 * len(points), -1), uvs.reshape(-1, 2)], axis=1).astype(np.float32)
-    corners = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1, 3)
-    labels = np.arange(corners.max(initial=-1) + 1)  # of corners: the lowest corner that each hangs together with
-    while True:
-        lowest = labels[corners].min(axis=1)
-        after = labels.copy()
-        np.minimum.at(after, labels[corners].reshape(-1), np.repeat(lowest, 3))
-        np.minimum.at(after, corners.reshape(-1), np.repeat(lowest, 3))
-        after = after[after]
-        if np.array_equal(after, labels):
-            return np.unique(labels[corners[:, 0]], return_inverse=True)[1].astype(np.int32)
-        labels = after
