@@ -14,8 +14,8 @@ LEAST_RASTER, MOST_RASTER = 128, 1024
 """Texels along a side of the picture in which overlaps are counted: 16 times the root of the number of triangles."""
 MARGIN = 1e-4
 """Barycentric coordinate from which on a texel's centre lies within a triangle: neighbours share those at 0."""
-BATCH = 1 << 21
-"""Texels in boxes of triangles that are looked at together."""
+FIRST_BATCH, MOST_BATCH = 1 << 14, 1 << 20
+"""Texels in boxes of triangles that are looked at together: few at first, as most uv that overlap do so at once."""
 
 
 def why_unfit(uvs: np.ndarray | None, areas: np.ndarray) -> str | None:
@@ -62,9 +62,9 @@ def overlap(uvs: np.ndarray) -> tuple[float, bool]:
     counts = size.prod(axis=1)
     ends = np.cumsum(counts)
     covers = np.zeros(width * height, np.uint8)
-    begin = 0
+    begin, batch = 0, FIRST_BATCH
     while begin < len(uvs):
-        end = max(int(np.searchsorted(ends, ends[begin] - counts[begin] + BATCH, side="right")), begin + 1)
+        end = max(int(np.searchsorted(ends, ends[begin] - counts[begin] + batch, side="right")), begin + 1)
         chosen = np.repeat(np.arange(begin, end), counts[begin:end])
         rank = np.arange(len(chosen)) - np.repeat(
             ends[begin:end] - counts[begin:end] - ends[begin] + counts[begin], counts[begin:end]
@@ -73,7 +73,7 @@ def overlap(uvs: np.ndarray) -> tuple[float, bool]:
         inside = _is_inside(corners[chosen], np.stack([x, y], axis=1) + 0.5)
         found = np.bincount((y * width + x)[inside], minlength=len(covers))
         covers = np.minimum(covers + np.minimum(found, 2), 2).astype(np.uint8)
-        begin = end
+        begin, batch = end, min(2 * batch, MOST_BATCH)
         if np.count_nonzero(covers == 2) > MOST_OVERLAP * len(covers):
             break
     covered = np.count_nonzero(covers)
