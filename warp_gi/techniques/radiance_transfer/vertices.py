@@ -6,7 +6,7 @@ import numpy as np
 
 from warp_gi.errors import SceneError
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.radiance_transfer.atlas import can_be_charted, part_numbers
+from warp_gi.techniques.radiance_transfer.atlas import can_be_charted, scene_parts
 from warp_gi.techniques.radiance_transfer.textures import Atlas
 
 INWARDS = 1e-3
@@ -24,7 +24,7 @@ def vertex_atlas(scene: Scene) -> Atlas:
     """
     flat = scene._flat
     points = flat.points[flat.indices].astype(np.float64)
-    faces = np.flatnonzero(can_be_charted(points) & (part_numbers(scene) >= 0))
+    faces = np.flatnonzero(can_be_charted(points) & (scene_parts(scene)[0] >= 0))
     if len(faces) == 0:
         raise SceneError("no surface in this scene rests and has an area; nothing can be baked")
     sides = points[faces, 1:] - points[faces, :1]
