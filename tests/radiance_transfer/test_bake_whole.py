@@ -258,6 +258,30 @@ def test_lamps_without_reflection_reach_nothing():
     assert not result.lamps[on_floor].any() and result.lamps[~on_floor & (result.atlas.slot_sides == 0)].mean() > 0.01
 
 
+@pytest.mark.parametrize("source", ["sky", "point", "surface"])
+def test_light_of_the_floor_is_that_of_the_path_tracer(source):
+    lamp = gi.Material("lamp", (0, 0, 0), specular=0.0, emission=(3.0, 2.0, 1.0))
+    lights = [gi.PunctualLight("point", (2.0, 4.0, 8.0), (1.0, 1.0, 1.0))] if source == "point" else []
+    parts = [gi.Node("lamp", [quad((0.5, 1.5, 0.5), (1, 0, 0), (0, 0, 1), lamp)])] if source == "surface" else []
+    scene = gi.Scene([*court().nodes, *parts], lights, 1.0 if source == "sky" else None)
+    textures = transfer_textures(bake_transfer(scene, transfer_settings(resolution=256, tolerance=1e-4), "cpu"))
+    camera = gi.Camera.look_at((0.4, 3.0, 1.0), (0.3, 0.0, 1.0), hfov=2.0, resolution=(8, 8))
+    frame = next(gi.render(scene, camera, gi.Pipeline(spp=512)))
+    atlas, geometry = textures.atlas, scene.data("cpu").geometry
+    corners = geometry.points.numpy()[geometry.indices.numpy()][atlas.slot_faces]
+    weights = np.column_stack([1 - atlas.slot_points.sum(axis=1), atlas.slot_points])
+    away = np.einsum("sc,scx->sx", weights, corners) - (0.3, 0, 1)
+    near = (atlas.slot_faces < 32) & (atlas.slot_sides == 0) & (np.linalg.norm(away, axis=1) < 0.06)
+    white = np.sqrt(4 * np.pi)
+    bounced = textures.bounces[near, :, 0].mean(axis=0, dtype=float) * white * (source == "sky")
+    direct = textures.transfer[near, 0].mean(dtype=float) * white * (source == "sky")
+    if source != "sky":
+        bounced = bounced + textures.lamps[near].mean(axis=0)
+    for term, irradiance in (("indirect", bounced), ("environment", direct)):
+        expected = frame.numpy(term).reshape(-1, 3).mean(axis=0)
+        assert irradiance / np.pi == pytest.approx(expected, rel=0.02), term
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name, most_rays", [(LIVING_ROOM, 150), ("crytek_sponza.glb", 150), ("modern_hall.glb", 300)])
 def test_error_of_real_scenes(name, most_rays):
