@@ -114,7 +114,7 @@ def bake_transfer(
         progress: Called with the share that is done.
         keep_hits: Whether to keep the hits for ``regather``, in 4 bytes a ray of bounces.
 
-    Raises OptionError where charts fail, SceneError where nothing in the scene rests.
+    Raises OptionError where charts fail, SceneError where no surface in the scene rests and has an area.
     """
     target = get_device(device)
     stages = _Stages(progress)
@@ -123,6 +123,8 @@ def bake_transfer(
         with stages.run("charts") as told:
             vertices = settings.storage == "vertices"
             atlas = vertex_atlas(scene) if vertices else make_atlas(scene, settings, device, told)
+        if atlas.count == 0:
+            raise SceneError("no surface in this scene rests and has an area; nothing can be baked")
         with stages.run("rays") as told:
             work = transfer_work(scene, atlas, settings, target, seed)
             lamps = _lamps(work, scene, seed)
