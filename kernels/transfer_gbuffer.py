@@ -1,7 +1,7 @@
 """The G-buffer of an atlas: which face lies nearest to each texel, and where on it.
 
-Faces are binned on the host into tiles of TILE x TILE texels. A texel takes the nearest point of the faces of its tile if
-it lies less than a texel away along each axis: just those texels are touched by bilinear fetches inside faces.
+Faces are binned on the host into tiles of TILE x TILE texels. A texel takes the nearest point that the faces of its tile
+have at most a texel away along each axis: just those texels are touched by bilinear fetches inside faces.
 """
 
 import warp as wp
@@ -25,18 +25,30 @@ class TransferTexels:
     points: wp.array(dtype=wp.vec2)  # barycentric coordinates u, v of the nearest point
 
 
-# Share of the way from a to b at which a segment is nearest to the origin.
+# Share of the way from a to b at which a segment, cut off at the square, is nearest to the origin; -1 if it is outside.
 @wp.func
 def nearest_share(a: wp.vec2, b: wp.vec2) -> wp.float32:
     d = b - a
+    low = float(0.0)
+    high = float(1.0)
+    for axis in range(2):
+        if d[axis] != 0.0:
+            s = (-1.0 - a[axis]) / d[axis]
+            t = (1.0 - a[axis]) / d[axis]
+            low = wp.max(low, wp.min(s, t))
+            high = wp.min(high, wp.max(s, t))
+        elif wp.abs(a[axis]) > 1.0:
+            return -1.0
+    if low > high:
+        return -1.0
     size = wp.dot(d, d)
-    if size <= 0.0:
+    if size == 0.0:
         return 0.0
-    return wp.clamp(-wp.dot(a, d) / size, 0.0, 1.0)
+    return wp.clamp(-wp.dot(a, d) / size, low, high)
 
 
-# Barycentric coordinates u, v of the point of a triangle in the plane that is nearest to the origin, and the square of
-# its distance.
+# Of a triangle in the plane and the square of two texels a side around the origin, the barycentric coordinates u, v of
+# the common point that is nearest to the origin, and the square of its distance; that is infinite if there is none.
 @wp.func
 def nearest_point(a: wp.vec2, b: wp.vec2, c: wp.vec2) -> wp.vec3:
     area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
@@ -45,16 +57,18 @@ def nearest_point(a: wp.vec2, b: wp.vec2, c: wp.vec2) -> wp.vec3:
     w = area - u - v
     if area != 0.0 and u * area >= 0.0 and v * area >= 0.0 and w * area >= 0.0:
         return wp.vec3(u / area, v / area, 0.0)
+    best = wp.vec3(0.0, 0.0, wp.inf)
     s = nearest_share(a, b)
     p = a + (b - a) * s
-    best = wp.vec3(s, 0.0, wp.dot(p, p))
+    if s >= 0.0:
+        best = wp.vec3(s, 0.0, wp.dot(p, p))
     s = nearest_share(b, c)
     p = b + (c - b) * s
-    if wp.dot(p, p) < best[2]:
+    if s >= 0.0 and wp.dot(p, p) < best[2]:
         best = wp.vec3(1.0 - s, s, wp.dot(p, p))
     s = nearest_share(c, a)
     p = c + (a - c) * s
-    if wp.dot(p, p) < best[2]:
+    if s >= 0.0 and wp.dot(p, p) < best[2]:
         best = wp.vec3(0.0, 1.0 - s, wp.dot(p, p))
     return best
 
@@ -81,8 +95,7 @@ def find_texel_faces(first: wp.int32, tiles: TransferTiles, texels: TransferTexe
         b = tiles.corners[face, 1] - center
         c = tiles.corners[face, 2] - center
         at = nearest_point(a, b, c)
-        p = a * (1.0 - at[0] - at[1]) + b * at[0] + c * at[1]
-        if wp.abs(p[0]) < 1.0 and wp.abs(p[1]) < 1.0 and at[2] < nearest:
+        if at[2] < nearest:
             nearest = at[2]
             texels.faces[item] = face
             texels.points[item] = wp.vec2(at[0], at[1])

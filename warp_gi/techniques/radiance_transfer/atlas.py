@@ -34,7 +34,7 @@ def make_atlas(
     corners = np.zeros((len(points), 3, 2), np.float32)
     corners[kept] = page.corners
     face_pages = np.full(len(points), -1, np.int32)
-    face_pages[kept] = 0
+    face_pages[kept] = np.where(page.charts >= 0, 0, -1)
     face_charts = np.full(len(points), -1, np.int32)
     face_charts[kept] = page.charts
     pages = np.array([[0, page.width, page.height]], np.int32)

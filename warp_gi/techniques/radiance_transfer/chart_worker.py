@@ -21,6 +21,8 @@ CUT_TEXELS = 4.0
 ``charts.metric`` afterwards."""
 PADDING = 2
 """Texels between charts, beyond those that a bilinear fetch touches."""
+UNITS_A_TEXEL = 64.0
+"""Units of uv along about a texel, as xatlas gets them to pack: it drops triangles of an area below 1e-7 units^2."""
 NEAR = 0.97
 """Share of the wanted size that a page has to reach."""
 MOST_PACKS = 10
@@ -28,14 +30,13 @@ MOST_PACKS = 10
 
 
 def cut(points: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return uv [triangle, 3, 2] in texels of some page, and the chart of each triangle, int32, -1 without one.
-
-    ``points`` float32 [vertex, 3] are scaled so that the triangles' area is about 1.
-    """
+    """Return uv [triangle, 3, 2] in texels of some page, and the chart of each triangle, int32, -1 without one."""
     atlas = xatlas.Atlas()
     atlas.add_mesh(points, indices)
     pack = xatlas.PackOptions()
-    pack.texels_per_unit = float(np.clip(CUT_TEXELS * np.sqrt(len(indices)), 64.0, 2048.0))
+    sides = points[indices[:, 1:]] - points[indices[:, :1]]
+    size = float(np.sqrt(0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum()))
+    pack.texels_per_unit = float(np.clip(CUT_TEXELS * np.sqrt(len(indices)), 64.0, 2048.0)) / size
     pack.rotate_charts_to_axis = True
     atlas.generate(xatlas.ChartOptions(), pack)
     if atlas.chart_count == 0:
@@ -49,41 +50,43 @@ def cut(points: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def pack(uvs: np.ndarray, charts: np.ndarray, size: int, tell: Callable[[float], None]) -> dict[str, np.ndarray]:
     """Return charts with ``uvs`` [triangle, 3, 2] placed side by side on a page whose longer side is near ``size``.
 
-    ``corners`` float32 [triangle, 3, 2] are in texels; ``page`` int32 [2] is the width and height, or empty if the
-    charts do not fit, however small; ``scale`` float64 [1] is the number of texels along a unit of ``uvs``.
+    ``corners`` float32 [triangle, 3, 2] are in texels; ``is_placed`` bool [triangle] is false for those too thin for
+    xatlas; ``page`` int32 [2] is the width and height, or empty if the charts do not fit, however small.
     """
-    edges = uvs[:, 1:] - uvs[:, :1]
-    area = float(0.5 * np.abs(np.linalg.det(edges.astype(np.float64))).sum())
-    scale = size * np.sqrt(0.5 / max(area, 1e-30))
-    low, high, best = 0.0, np.inf, None
+    edges = (uvs[:, 1:] - uvs[:, :1]).astype(np.float64)
+    first = size * np.sqrt(0.5 / max(float(0.5 * np.abs(np.linalg.det(edges)).sum()), 1e-30))
+    uvs = (uvs * (UNITS_A_TEXEL * first)).astype(np.float32)
+    low, high, scale, best = 0.0, np.inf, 1.0, None
     for attempt in range(MOST_PACKS):
-        corners, page = _packed(uvs, charts, scale)
+        corners, is_placed, page = _packed(uvs, charts, scale / UNITS_A_TEXEL)
         got = max(page)
-        if got <= size:
-            if scale > low:
-                low, best = scale, (corners, page)
+        if got <= size and scale > low:
+            low, best = scale, (corners, is_placed, page)
             if got >= NEAR * size:
                 break
-        else:
+        elif got > size:
             high = min(high, scale)
-        wanted = scale * size / got * 0.99
-        inside = low < wanted < high
-        scale = wanted if inside else (low + min(high, 4.0 * low)) / 2.0 if low > 0.0 else scale / 2.0
+        scale *= 0.99 * size / got
+        if not low < scale < high:
+            scale = (low + min(high, 4.0 * low)) / 2.0 if low > 0.0 else high / 2.0
         tell((attempt + 1) / MOST_PACKS)
     if best is None:
-        return {"corners": np.zeros_like(uvs), "page": np.zeros(0, np.int32), "scale": np.zeros(1)}
-    return {"corners": best[0], "page": np.array(best[1], np.int32), "scale": np.array([low])}
+        best = np.zeros_like(uvs), np.zeros(len(uvs), bool), ()
+    return {"corners": best[0], "is_placed": best[1], "page": np.array(best[2], np.int32)}
 
 
-def _packed(uvs: np.ndarray, charts: np.ndarray, scale: float) -> tuple[np.ndarray, tuple[int, int]]:
+def _packed(uvs: np.ndarray, charts: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
+    """Return corners, which triangles have some, and width and height of the page at ``scale`` texels a unit."""
     atlas = xatlas.Atlas()
-    points, corners = _welded(uvs, charts)
-    atlas.add_uv_mesh(points, corners, charts.astype(np.uint32).reshape(-1, 1))
+    points, places = _welded(uvs, charts)
+    atlas.add_uv_mesh(points, places, charts.astype(np.uint32).reshape(-1, 1))
     options = xatlas.PackOptions()
-    options.padding, options.bilinear, options.texels_per_unit = PADDING, True, float(scale)
+    options.padding, options.bilinear, options.texels_per_unit = PADDING, True, scale
     atlas.generate(xatlas.ChartOptions(), options)
-    _, corners, packed = atlas.get_mesh(0)
-    return packed[corners] * np.array([atlas.width, atlas.height], np.float32), (atlas.width, atlas.height)
+    _, places, packed = atlas.get_mesh(0)
+    has_chart = atlas.get_mesh_vertex_assignment(0)[1].astype(np.int32) >= 0
+    size = (atlas.width, atlas.height)
+    return packed[places] * np.array(size, np.float32), has_chart[places].all(axis=1), size
 
 
 def _welded(uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

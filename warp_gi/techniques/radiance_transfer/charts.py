@@ -19,6 +19,9 @@ from warp_gi.errors import OptionError
 Progress = Callable[[float], None]
 """Called with the share of the work that is done."""
 
+TRIANGLE_SIZE = 64.0
+"""Root of the mean area of a part's triangles as xatlas gets them: it drops those of an area below 1e-7, in any unit."""
+
 
 @dataclass(frozen=True, eq=False)
 class Page:
@@ -27,7 +30,7 @@ class Page:
     corners: np.ndarray
     """Corners of faces in texels, float32 [face, 3, 2]."""
     charts: np.ndarray
-    """Chart of each face, int32 [face]."""
+    """Chart of each face, int32 [face]; -1 for faces too thin to be placed."""
     width: int
     """Texels along x."""
     height: int
@@ -137,8 +140,8 @@ def cut_charts(
     for begin, end in zip(starts[:-1], starts[1:], strict=True):
         corners = points[begin:end].reshape(-1, 3)
         sides = points[begin:end, 1:] - points[begin:end, :1]
-        size = np.sqrt(0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum())
-        places = ((corners - corners.min(axis=0)) / size).astype(np.float32)
+        size = np.sqrt(0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).mean())
+        places = ((corners - corners.min(axis=0)) * (TRIANGLE_SIZE / size)).astype(np.float32)
         vertices, indices = np.unique(places, axis=0, return_inverse=True)
         all_points.append(vertices)
         all_indices.append(indices.reshape(-1, 3).astype(np.uint32))
@@ -183,4 +186,4 @@ def packed(uvs: np.ndarray, charts: np.ndarray, size: int, job: ChartJob, progre
             ' transfer at vertices (storage="vertices")'
         )
     width, height = (int(n) for n in result["page"])
-    return Page(result["corners"], charts, width, height)
+    return Page(result["corners"], np.where(result["is_placed"], charts, -1).astype(np.int32), width, height)
