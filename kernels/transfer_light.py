@@ -13,13 +13,13 @@ from warp_gi.kernels.path_samplers import KnownRadiance, PathCache
 from warp_gi.kernels.surface import Surface, ray_origin, shading_normal
 from warp_gi.kernels.transfer_atlas import SlotFetch, TransferAtlas, atlas_fetch, side_seen
 from warp_gi.kernels.transfer_lobes import LobeTable, lobe_at
-from warp_gi.kernels.transfer_native import bounced_product, environment_product, glossy_product
+from warp_gi.kernels.transfer_products import bounced_product, environment_product, glossy_product
 from warp_gi.kernels.types import Environment, SceneData
 
 wp.set_module_options({"enable_backward": False})
 
 
-# What a bake holds, and where it is kept. Rows are padded (transfer_native.py).
+# What a bake holds, and where it is kept. Rows are padded (transfer_products.py).
 @wp.struct
 class TransferRows:
     atlas: TransferAtlas

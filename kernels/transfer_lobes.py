@@ -5,7 +5,7 @@ The table is fitted on the host (techniques/radiance_transfer/lobes.py).
 
 import warp as wp
 
-from warp_gi.kernels.transfer_native import vec6
+from warp_gi.kernels.transfer_products import vec6
 
 wp.set_module_options({"enable_backward": False})
 

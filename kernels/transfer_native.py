@@ -1,7 +1,7 @@
-"""Products of rows of transfer, eight numbers at a time on the CPU; on CUDA, whose threads are lanes already, a loop.
+"""Native code of the bake of transfer: sums of spherical harmonics over rays, and means of rows of halves over hits.
 
-A row of transfer has 25 numbers padded to 32, or 36 padded to 40, as halves: 32 are one cache line. Rows are read,
-blended and multiplied in registers. Loops in Warp itself, over vectors of 25, were 28 times slower.
+On the CPU it works on eight numbers at a time in clang's portable vector types, and on halves where the processor
+converts them; CUDA, and other processors, run the same formulas one number at a time.
 """
 
 import math
@@ -10,268 +10,248 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-ORDERS = (5, 6)
-WIDTHS = {5: 32, 6: 40}  # numbers in a row, with padding
-LIGHT_WIDTH = WIDTHS[5]  # of the sky's own numbers, and of what bounces: always order 5
-LARGEST_ORDER = 6
-vec6 = wp.types.vector(length=6, dtype=wp.float32)
+MOST_NUMBERS = 36  # order 6
+LIGHT_NUMBERS = wp.constant(25)
+ROW_NUMBERS = 80  # a row of bounces: three channels of 25 numbers, and five zeros
+BLOCK_RAYS = wp.constant(64)  # rays whose visibility one word holds
+Numbers = wp.types.vector(length=MOST_NUMBERS, dtype=wp.float32)
 
 
-def harmonics_code(order: int) -> str:
-    """Return C++ that sets y[0 .. order^2) from a unit direction x, y_, z: real spherical harmonics of any order.
+def _factor(degree: int, power: int) -> float:
+    ratio = math.factorial(degree - power) / math.factorial(degree + power)
+    return math.sqrt((2 * degree + 1) / (4 * math.pi) * ratio * (1 if power == 0 else 2))
 
-    Y_lm = K_lm P_l^|m|(z) times sqrt(2) Re or Im of (x + i y)^|m|, without the Condon-Shortley sign; index l l + l + m.
-    The polynomials follow (l - m) P_l = (2 l - 1) z P_(l-1) - (l + m - 1) P_(l-2), with P_m^m = (2 m - 1)!!.
-    """
-    lines = ["float re = 1.0f, im = 0.0f, next = 0.0f;"]
-    for m in range(order):
-        last = f"p{m}_{m}"
-        lines.append(f"const float {last} = {math.prod(range(1, 2 * m, 2))}.0f;")
-        for l in range(m, order):
-            name = f"p{l}_{m}"
-            if l == m + 1:
-                lines.append(f"const float {name} = {2 * m + 1}.0f * z * {last};")
-            elif l > m + 1:
-                lines.append(
-                    f"const float {name} = ({2 * l - 1}.0f * z * p{l - 1}_{m} - {l + m - 1}.0f * p{l - 2}_{m}) "
-                    f"* {1 / (l - m)!r}f;"
-                )
-            scale = math.sqrt((2 * l + 1) / (4 * math.pi) * math.factorial(l - m) / math.factorial(l + m))
-            if m == 0:
-                lines.append(f"y[{l * l + l}] = {scale!r}f * {name};")
-            else:
-                scale *= math.sqrt(2)
-                lines.append(f"y[{l * l + l + m}] = {scale!r}f * {name} * re;")
-                lines.append(f"y[{l * l + l - m}] = {scale!r}f * {name} * im;")
-        lines.append("next = re * x - im * y_; im = re * y_ + im * x; re = next;")
+
+# d^m P_l / dz^m of the Legendre polynomials, by degree l and order m: harmonics divided by their factor and by
+# Re or Im (x + i y)^m.
+_POLYNOMIALS = {
+    (0, 0): "one",
+    (1, 0): "z",
+    (1, 1): "one",
+    (2, 0): "0.5f * (3.0f * z2 - 1.0f)",
+    (2, 1): "3.0f * z",
+    (2, 2): "3.0f * one",
+    (3, 0): "0.5f * z * (5.0f * z2 - 3.0f)",
+    (3, 1): "1.5f * (5.0f * z2 - 1.0f)",
+    (3, 2): "15.0f * z",
+    (3, 3): "15.0f * one",
+    (4, 0): "0.125f * ((35.0f * z2 - 30.0f) * z2 + 3.0f)",
+    (4, 1): "2.5f * z * (7.0f * z2 - 3.0f)",
+    (4, 2): "7.5f * (7.0f * z2 - 1.0f)",
+    (4, 3): "105.0f * z",
+    (4, 4): "105.0f * one",
+    (5, 0): "0.125f * z * ((63.0f * z2 - 70.0f) * z2 + 15.0f)",
+    (5, 1): "1.875f * ((21.0f * z2 - 14.0f) * z2 + 1.0f)",
+    (5, 2): "52.5f * z * (3.0f * z2 - 1.0f)",
+    (5, 3): "52.5f * (9.0f * z2 - 1.0f)",
+    (5, 4): "945.0f * z",
+    (5, 5): "945.0f * one",
+}
+
+
+def _degree(degree: int) -> str:
+    lines = []
+    for power in range(degree + 1):
+        center = degree * degree + degree
+        name = f"p{degree}{power}"
+        lines.append(f"const auto {name} = {_factor(degree, power)!r}f * ({_POLYNOMIALS[degree, power]});")
+        if power == 0:
+            lines.append(f"add({center}, {name});")
+        else:
+            lines.append(f"add({center + power}, {name} * c{power});")
+            lines.append(f"add({center - power}, {name} * s{power});")
     return "\n        ".join(lines)
 
 
-# What every product starts with: vectors of eight, and how a blend of rows gets into registers. `four` and `five` are
-# their number in a row. Without instructions for halves the compiler would call a library that is not there.
-_VECTORS = """
-#if !defined(__CUDA_ARCH__) && (defined(__F16C__) || defined(__aarch64__))
-    typedef float Eight __attribute__((vector_size(32)));
-    typedef _Float16 Halves __attribute__((vector_size(16)));
-    struct Four { enum { N = 4 }; };
-    struct Five { enum { N = 5 }; };
-    auto load = [](const float* at) { Eight v; __builtin_memcpy(&v, at, 32); return v; };
-    auto row_part = [](const wp::half* at) {
-        Halves h; __builtin_memcpy(&h, at, 16); return __builtin_convertvector(h, Eight);
-    };
-    auto total = [](Eight v) {
-        return ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7]));
+# Hands each real spherical harmonic at a unit direction to `add(index, value)`: 25 of them, or 36 where order > 5.
+# Index l^2 + l + m, orthonormal, without the Condon-Shortley sign, polar axis z, as kernels/harmonics.py.
+_HARMONICS = """
+    auto harmonics = [](auto x, auto y, auto z, int order, auto add) {
+        #pragma clang fp contract(fast)
+        const auto one = z * 0.0f + 1.0f, z2 = z * z;
+        const auto c1 = x, s1 = y;
+        const auto c2 = x * c1 - y * s1, s2 = x * s1 + y * c1;
+        const auto c3 = x * c2 - y * s2, s3 = x * s2 + y * c2;
+        const auto c4 = x * c3 - y * s3, s4 = x * s3 + y * c3;
+        LOW
+        if (order <= 5) return;
+        const auto c5 = x * c4 - y * s4, s5 = x * s4 + y * c4;
+        HIGH
     };
 """
+_HARMONICS = _HARMONICS.replace("LOW", "\n        ".join(_degree(degree) for degree in range(5)))
+_HARMONICS = _HARMONICS.replace("HIGH", _degree(5))
+_PRAGMA = "#pragma clang fp contract(fast)"
+_PORTABLE_HARMONICS = _HARMONICS.replace(_PRAGMA, "")
 
-# Sum over the numbers of a row of T, blended, times the light's, for red, green and blue.
-_ENVIRONMENT = (
-    "    wp::vec_t<3, float> result;\n"
-    + _VECTORS
+
+# Sums of the harmonics over those of `count` (at most 64) directions from `start` on whose bits are set in `chosen`.
+# directions [axis, item] are local, and have eight items more than anyone asks for; `frame` is world_from_local.
+@wp.func_native(
+    snippet="wp::vec_t<36, float> result;\n#if defined(__CUDA_ARCH__)\n"
+    + _PORTABLE_HARMONICS
     + """
-    auto run = [&](auto tag) {
-        enum { N = decltype(tag)::N };
-        Eight sum[N];
-        for (int v = 0; v < N; ++v) sum[v] = Eight{};
-        for (int k = 0; k < 4; ++k) {
-            if (shares[k] == 0.0f) continue;
-            const wp::half* row = transfer.data + (size_t)slots[k] * (8 * N);
-            for (int v = 0; v < N; ++v) sum[v] += row_part(row + 8 * v) * shares[k];
-        }
-        for (int c = 0; c < 3; ++c) {
-            Eight product = Eight{};
-            for (int v = 0; v < N; ++v) product += sum[v] * load(light.data + (c * N + v) * 8);
-            result[c] = total(product);
-        }
-    };
-    if (width == 32) run(Four()); else run(Five());
-#else
-    for (int k = 0; k < 4; ++k) {
-        if (shares[k] == 0.0f) continue;
-        const wp::half* row = transfer.data + (size_t)slots[k] * width;
-        for (int c = 0; c < 3; ++c) {
-            float product = 0.0f;
-            for (int i = 0; i < width; ++i) product += float(row[i]) * light.data[c * width + i];
-            result[c] += product * shares[k];
-        }
+    const int stride = directions.strides[0] / (int)sizeof(float);
+    for (int i = 0; i < count; ++i) {
+        if (!((chosen >> i) & 1ull)) continue;
+        const float* at = directions.data + start + i;
+        const wp::vec3 d = wp::mul(frame, wp::vec3(at[0], at[stride], at[2 * stride]));
+        harmonics(d[0], d[1], d[2], order, [&](int k, float value) { result[k] += value; });
     }
+#else
+"""
+    + _HARMONICS
+    + """
+    typedef float f8 __attribute__((vector_size(32)));
+    typedef int i8 __attribute__((vector_size(32)));
+    const int stride = directions.strides[0] / (int)sizeof(float);
+    const i8 lanes = {1, 2, 4, 8, 16, 32, 64, 128};
+    f8 sums[36] = {};
+    for (int i = 0; i < count; i += 8) {
+        int bits = (int)(chosen >> i) & 255;
+        if (count - i < 8) bits &= (1 << (count - i)) - 1;
+        if (!bits) continue;
+        const f8 weight = (((bits - (i8) {}) & lanes) != 0) ? 1.0f - (f8) {} : (f8) {};
+        f8 local[3], d[3];
+        for (int axis = 0; axis < 3; ++axis)
+            __builtin_memcpy(&local[axis], directions.data + axis * stride + start + i, sizeof(f8));
+        for (int axis = 0; axis < 3; ++axis)
+            d[axis] = frame.data[axis][0] * local[0] + frame.data[axis][1] * local[1] + frame.data[axis][2] * local[2];
+        harmonics(d[0], d[1], d[2], order, [&](int k, f8 value) {
+            #pragma clang fp contract(fast)
+            sums[k] += weight * value;
+        });
+    }
+    for (int k = 0; k < (order > 5 ? 36 : 25); ++k)
+        result[k] = ((sums[k][0] + sums[k][4]) + (sums[k][1] + sums[k][5]))
+            + ((sums[k][2] + sums[k][6]) + (sums[k][3] + sums[k][7]));
 #endif
     return result;
 """
 )
+def harmonic_sums(
+    directions: wp.array2d(dtype=wp.float32),
+    start: wp.int32,
+    count: wp.int32,
+    chosen: wp.uint64,
+    frame: wp.mat33,
+    order: wp.int32,
+) -> Numbers: ...
 
-# The same where each channel has a row of its own: what bounces.
-_BOUNCED = (
-    "    wp::vec_t<3, float> result;\n"
-    + _VECTORS
+
+# The harmonics at one direction.
+@wp.func_native(
+    snippet=_PORTABLE_HARMONICS
     + """
-    for (int c = 0; c < 3; ++c) {
-        Eight product = Eight{};
-        for (int k = 0; k < 4; ++k) {
-            if (shares[k] == 0.0f) continue;
-            const wp::half* row = bounces.data + ((size_t)slots[k] * 3 + c) * 32;
-            Eight one = Eight{};
-            for (int v = 0; v < 4; ++v) one += row_part(row + 8 * v) * load(light.data + (c * 4 + v) * 8);
-            product += one * shares[k];
-        }
-        result[c] = total(product);
-    }
-#else
-    for (int k = 0; k < 4; ++k) {
-        if (shares[k] == 0.0f) continue;
-        const wp::half* row = bounces.data + (size_t)slots[k] * 96;
-        for (int c = 0; c < 3; ++c) {
-            float product = 0.0f;
-            for (int i = 0; i < 32; ++i) product += float(row[c * 32 + i]) * light.data[c * 32 + i];
-            result[c] += product * shares[k];
-        }
-    }
-#endif
+    wp::vec_t<36, float> result;
+    harmonics(d[0], d[1], d[2], order, [&](int k, float value) { result[k] = value; });
     return result;
 """
 )
+def harmonics_at(d: wp.vec3, order: wp.int32) -> Numbers: ...
 
-# A lobe, of factors lobe[l] about a direction, times the light's matrix, and that times T, blended: the triple product
-# with fixed light. W_cj = sum_k M_ckj F_k comes first, so that the same W serves T and the transfer of a point that
-# nothing shades, lobe by lobe A_l y(n): results 0 to 2, and 3 to 5.
-_GLOSSY = (
-    "    wp::vec_t<6, float> result;\n"
-    + _VECTORS
-    + """
-    auto run = [&](auto tag) {
-        enum { N = decltype(tag)::N, COUNT = decltype(tag)::N == 4 ? 25 : 36 };
-        const int order = N == 4 ? 5 : 6;
-        float y[40] = {};
-        auto functions = [&](wp::vec3 d) {
-            const float x = d[0], y_ = d[1], z = d[2];
-            if (N == 4) {
-        ORDER_FIVE
-            } else {
-        ORDER_SIX
-            }
-        };
-        functions(direction);
-        Eight product[3][N];
-        for (int c = 0; c < 3; ++c) for (int v = 0; v < N; ++v) product[c][v] = Eight{};
-        int k = 0;
-        for (int l = 0; l < order; ++l) {
-            for (int m = 0; m < 2 * l + 1; ++m, ++k) {
-                const float factor = lobe[l] * y[k];
-                const float* rows = matrix.data + k * (24 * N);
-                for (int c = 0; c < 3; ++c)
-                    for (int v = 0; v < N; ++v) product[c][v] += load(rows + (c * N + v) * 8) * factor;
-            }
-        }
-        Eight sum[N];
-        for (int v = 0; v < N; ++v) sum[v] = Eight{};
-        for (int k = 0; k < 4; ++k) {
-            if (shares[k] == 0.0f) continue;
-            const wp::half* row = transfer.data + (size_t)slots[k] * (8 * N);
-            for (int v = 0; v < N; ++v) sum[v] += row_part(row + 8 * v) * shares[k];
-        }
-        functions(normal);
-        const float cosine[6] = {COSINE};
-        for (int l = 0, i = 0; l < order; ++l) for (int m = 0; m < 2 * l + 1; ++m, ++i) y[i] *= cosine[l];
-        for (int c = 0; c < 3; ++c) {
-            Eight shaded = Eight{}, open = Eight{};
-            for (int v = 0; v < N; ++v) {
-                shaded += product[c][v] * sum[v];
-                open += product[c][v] * load(y + 8 * v);
-            }
-            result[c] = total(shaded);
-            result[3 + c] = total(open);
-        }
-    };
-    if (width == 32) run(Four()); else run(Five());
+
+# Transfer where nothing is in the way: A_l y(n), A = pi, 2 pi/3, pi/4, 0, -pi/24, 0.
+@wp.func
+def open_transfer(n: wp.vec3, order: wp.int32) -> Numbers:
+    y = harmonics_at(n, order)
+    y[0] = y[0] * wp.pi
+    for k in range(1, 4):
+        y[k] = y[k] * (2.0 * wp.pi / 3.0)
+    for k in range(4, 9):
+        y[k] = y[k] * (wp.pi / 4.0)
+    for k in range(9, 16):
+        y[k] = 0.0
+    for k in range(16, 25):
+        y[k] = y[k] * (-wp.pi / 24.0)
+    for k in range(25, 36):
+        y[k] = 0.0
+    return y
+
+
+@wp.func_native(
+    """
+#if defined(__CUDA_ARCH__)
+    return __popcll(word);
 #else
-    const int order = width == 32 ? 5 : 6;
-    float y[40] = {}, open[40] = {}, sum[40] = {};
-    auto functions = [&](wp::vec3 d) {
-        const float x = d[0], y_ = d[1], z = d[2];
-        if (order == 5) {
-        ORDER_FIVE
-        } else {
-        ORDER_SIX
-        }
-    };
-    const float cosine[6] = {COSINE};
-    functions(normal);
-    for (int l = 0, i = 0; l < order; ++l) for (int m = 0; m < 2 * l + 1; ++m, ++i) open[i] = y[i] * cosine[l];
-    functions(direction);
-    for (int k = 0; k < 4; ++k) {
-        if (shares[k] == 0.0f) continue;
-        const wp::half* row = transfer.data + (size_t)slots[k] * width;
-        for (int i = 0; i < width; ++i) sum[i] += float(row[i]) * shares[k];
-    }
-    for (int l = 0, k = 0; l < order; ++l) {
-        for (int m = 0; m < 2 * l + 1; ++m, ++k) {
-            const float factor = lobe[l] * y[k];
-            for (int c = 0; c < 3; ++c) {
-                const float* row = matrix.data + (k * 3 + c) * width;
-                for (int i = 0; i < order * order; ++i) {
-                    result[c] += factor * row[i] * sum[i];
-                    result[3 + c] += factor * row[i] * open[i];
-                }
-            }
-        }
-    }
+    return __builtin_popcountll(word);
 #endif
-    return result;
 """
 )
+def bit_count(word: wp.uint64) -> wp.int32: ...
 
 
-def clamped_cosine(order: int) -> list[float]:
-    """Return A_l, the zonal factors of max(0, cos): pi, 2 pi/3, pi/4, 0, -pi/24, 0, ... (Ramamoorthi 2001, Eq. 8)."""
-    result = []
-    for l in range(order):
-        if l == 1:
-            result.append(2 * math.pi / 3)
-        elif l % 2:
-            result.append(0.0)
-        else:
-            half = l // 2
-            choose = math.factorial(l) / (2.0**l * math.factorial(half) ** 2)
-            result.append(2 * math.pi * (-1.0) ** (half + 1) * choose / ((l + 2) * (l - 1)))
-    return result
+_VECTOR_HALVES = "!defined(__CUDA_ARCH__) && (defined(__F16C__) || defined(__aarch64__))"
 
 
-def _filled(snippet: str) -> str:
-    cosine = ", ".join(f"{value!r}f" for value in clamped_cosine(LARGEST_ORDER))
-    parts = {"ORDER_FIVE": harmonics_code(5), "ORDER_SIX": harmonics_code(6), "COSINE": cosine}
-    for name, text in parts.items():
-        snippet = snippet.replace(name, text)
-    return snippet
-
-
-# Light that arrives through a blend of rows `slots`, by `light` [3, width].
-@wp.func_native(snippet=_ENVIRONMENT)
-def environment_product(
-    transfer: wp.array(dtype=wp.float16),
-    width: wp.int32,
-    slots: wp.vec4i,
-    shares: wp.vec4,
-    light: wp.array(dtype=wp.float32),
+# Gathers at a slot what its hits reflect, the mean of rows [slot, 80] over hits [slot, ray], with nothing from those
+# below 0. Writes it to bounces [slot, 75], and what the slot reflects of it and of direct light itself to next.
+# Returns the means of the first number of each channel.
+@wp.func_native(
+    snippet=f"""
+    float mean[80] = {{}};
+    const int* hit = hits.data + (long long)slot * hits.shape[1];
+    const float scale = count ? 1.0f / (float)count : 0.0f;
+#if {_VECTOR_HALVES}
+    typedef float f8 __attribute__((vector_size(32)));
+    typedef _Float16 h8 __attribute__((vector_size(16)));
+    f8 sums[10] = {{}};
+    const int ahead = 8;
+    for (int i = 0; i < count; ++i) {{
+        if (i + ahead < count && hit[i + ahead] >= 0) {{
+            const char* later = (const char*)(rows.data + (long long)hit[i + ahead] * 80);
+            for (int line = 0; line < 3; ++line) __builtin_prefetch(later + 64 * line);
+        }}
+        if (hit[i] < 0) continue;
+        h8 row[10];
+        __builtin_memcpy(row, rows.data + (long long)hit[i] * 80, sizeof(row));
+        for (int k = 0; k < 10; ++k) sums[k] += __builtin_convertvector(row[k], f8);
+    }}
+    for (int k = 0; k < 10; ++k) {{
+        const f8 value = sums[k] * scale;
+        __builtin_memcpy(mean + 8 * k, &value, sizeof(f8));
+    }}
+#else
+    for (int i = 0; i < count; ++i) {{
+        if (hit[i] < 0) continue;
+        const auto* row = rows.data + (long long)hit[i] * 80;
+        for (int k = 0; k < 75; ++k) mean[k] += (float)row[k];
+    }}
+    for (int k = 0; k < 75; ++k) mean[k] *= scale;
+#endif
+    float reflected[80] = {{}};
+    const auto* direct = transfer.data + (long long)slot * transfer.shape[1];
+    for (int k = 0; k < 75; ++k) reflected[k] = albedo[k / 25] * ((float)direct[k % 25] + mean[k]);
+    auto* kept = bounces.data + (long long)slot * 75;
+    auto* target = next.data + (long long)slot * 80;
+#if {_VECTOR_HALVES}
+    h8 halves[10];
+    for (int k = 0; k < 10; ++k) {{
+        f8 value;
+        __builtin_memcpy(&value, reflected + 8 * k, sizeof(f8));
+        halves[k] = __builtin_convertvector(value, h8);
+    }}
+    __builtin_memcpy(target, halves, sizeof(halves));
+    for (int k = 0; k < 10; ++k) {{
+        f8 value;
+        __builtin_memcpy(&value, mean + 8 * k, sizeof(f8));
+        halves[k] = __builtin_convertvector(value, h8);
+    }}
+    __builtin_memcpy(kept, halves, 75 * sizeof(_Float16));
+#else
+    for (int k = 0; k < 80; ++k) target[k] = wp::half(reflected[k]);
+    for (int k = 0; k < 75; ++k) kept[k] = wp::half(mean[k]);
+#endif
+    return wp::vec3(mean[0], mean[25], mean[50]);
+"""
+)
+def gather_row(
+    slot: wp.int32,
+    hits: wp.array2d(dtype=wp.int32),
+    count: wp.int32,
+    rows: wp.array2d(dtype=wp.float16),
+    transfer: wp.array2d(dtype=wp.float16),
+    albedo: wp.vec3,
+    bounces: wp.array2d(dtype=wp.float16),
+    next: wp.array2d(dtype=wp.float16),
 ) -> wp.vec3: ...
-
-
-# Light that arrives over other surfaces, by rows of red, green and blue, and `light` [3, 32].
-@wp.func_native(snippet=_BOUNCED)
-def bounced_product(
-    bounces: wp.array(dtype=wp.float16), slots: wp.vec4i, shares: wp.vec4, light: wp.array(dtype=wp.float32)
-) -> wp.vec3: ...
-
-
-# Light that a zonal lobe about a direction reflects: with transfer, and as if nothing shaded the point. `matrix` is
-# [k, channel, width].
-@wp.func_native(snippet=_filled(_GLOSSY))
-def glossy_product(
-    transfer: wp.array(dtype=wp.float16),
-    width: wp.int32,
-    slots: wp.vec4i,
-    shares: wp.vec4,
-    matrix: wp.array(dtype=wp.float32),
-    direction: wp.vec3,
-    lobe: vec6,
-    normal: wp.vec3,
-) -> vec6: ...

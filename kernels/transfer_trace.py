@@ -31,7 +31,7 @@ from warp_gi.kernels.transfer_light import (
     sun_radiance,
     surface_slots,
 )
-from warp_gi.kernels.transfer_native import environment_product
+from warp_gi.kernels.transfer_products import environment_product
 from warp_gi.kernels.transfer_shade import (
     WANTS_ENVIRONMENT,
     WANTS_INDIRECT,

@@ -45,7 +45,7 @@ def court(environment: object = None, floor: int = 1, specular: float = 0.0, rou
 
 def court_camera(resolution: tuple[int, int] = (480, 320)) -> gi.Camera:
     """Return a camera that looks down into the court."""
-    return gi.Camera.look_at((2.6, 3.4, 3.4), (-0.1, 0.4, -0.1), hfov=52, resolution=resolution)
+    return gi.Camera.look_at((1.85, 2.7, 1.85), (-0.35, 0.25, -0.35), hfov=64, resolution=resolution)
 
 
 def grid(corner: object, edge_u: object, edge_v: object, material: gi.Material, cells: int, name: str) -> gi.Mesh:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.kernels import path_trace, transfer_light, transfer_shade
-from warp_gi.kernels.transfer_native import ORDERS
+from warp_gi.kernels.transfer_products import ORDERS
 from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import whole_scene
 from warp_gi.stateful import Ahead, Service
@@ -129,7 +129,7 @@ class RadianceTransfer(Estimator, RadianceCache):
 
     def bake_key(self, scene: Scene | BakedScene) -> str:
         """Return a hash of all that the bake depends on: not of the sky."""
-        return transfer_key(whole_scene(scene))
+        return transfer_key(whole_scene(scene), self.bounces > 0)
 
     def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Setting]:
         """Return the settings that the bake depends on."""
@@ -174,8 +174,8 @@ class RadianceTransfer(Estimator, RadianceCache):
             return  # the first of them did it
         query, buffers = transfer_shade.TransferQuery(), transfer_shade.TransferBuffers()
         buffers.width, buffers.height = frame.camera.resolution
+        query.terms = sum(TERM_BITS[one.term] for one in alike)
         for one in alike:
-            query.terms |= TERM_BITS[one.term]
             setattr(buffers, one.term, frame[one.term])
             for order, moment in enumerate(frame.moments(one.term), 1):
                 setattr(buffers, f"{one.term}_moment{order}", moment)

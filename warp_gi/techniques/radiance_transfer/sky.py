@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_gi.kernels.transfer_light import TransferSky
-from warp_gi.kernels.transfer_native import LIGHT_WIDTH, WIDTHS
+from warp_gi.kernels.transfer_products import LIGHT_WIDTH, WIDTHS
 from warp_gi.launch import on_device
 from warp_gi.stateful import Ahead, Service
 from warp_gi.techniques.radiance_transfer import products

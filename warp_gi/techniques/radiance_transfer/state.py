@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_gi.baking import Bake
 from warp_gi.kernels.transfer_light import TransferRows
-from warp_gi.kernels.transfer_native import LIGHT_WIDTH, WIDTHS
+from warp_gi.kernels.transfer_products import LIGHT_WIDTH, WIDTHS
 from warp_gi.launch import get_device, on_device
 from warp_gi.techniques.radiance_transfer.textures import transfer_textures
 

@@ -1,0 +1,238 @@
+"""Transfer at the slots of an atlas: rays of the bake, and the light that lamps send to each slot (prt_textures.txt).
+
+A slot has one of 64 sets of directions about its shading normal, turned about it at random. Its first rays ask whether
+it sees sky and surfaces both; only then do the others follow. The first of them also find from where light bounces.
+"""
+
+import warp as wp
+
+from warp_gi.kernels.alias import alias_choice
+from warp_gi.kernels.bvh import bvh_intersect, bvh_occluded
+from warp_gi.kernels.emitters import LightChoice, sample_emitter
+from warp_gi.kernels.light_connections import SHADOW_END
+from warp_gi.kernels.sampling import (
+    OWN_DIMENSION,
+    circle,
+    cosine_direction,
+    hash_uint,
+    random_1d,
+    sample_1d,
+    sample_2d,
+)
+from warp_gi.kernels.surface import Surface, ray_origin, shading_normal, surface_shape
+from warp_gi.kernels.transfer_atlas import BACK, TransferAtlas, atlas_nearest, side_seen
+from warp_gi.kernels.transfer_native import BLOCK_RAYS, Numbers, bit_count, harmonic_sums, open_transfer
+from warp_gi.kernels.types import SceneData
+
+wp.set_module_options({"enable_backward": False})
+
+SETS = wp.constant(64)  # of directions
+SKY = wp.constant(-1)  # a ray that hits nothing
+BLACK = wp.constant(-2)  # a ray that hits what keeps no transfer, or starts below the surface
+DIRECTION_DIMENSION = OWN_DIMENSION  # directions of a set, by their number
+TURN_DIMENSION = wp.constant(3001)  # by slot, from here on: turn of its set (random)
+LAMP_DIMENSION = wp.constant(3002)  # which lamp,
+LAMP_DIGITS_DIMENSION = wp.constant(3003)  # its further digits (random),
+LAMP_POINT_DIMENSION = wp.constant(3004)  # and the point on it
+
+
+# Where the slots are: see warp_gi/techniques/radiance_transfer/textures.py.
+@wp.struct
+class TransferSlots:
+    faces: wp.array(dtype=wp.int32)  # [slot]
+    points: wp.array(dtype=wp.vec2)  # [slot] u, v
+    sides: wp.array(dtype=wp.uint8)  # [slot]
+
+
+@wp.struct
+class TransferRays:
+    directions: wp.array2d(dtype=wp.float32)  # [axis, set * set_size + item] local, and eight items more
+    set_size: wp.int32
+    first_rays: wp.int32  # of every slot
+    rays: wp.int32  # of slots that see sky and surfaces both; no fewer
+    bounce_rays: wp.int32  # the first so many also find the slots that they hit; no more than first_rays
+    order: wp.int32  # 5 or 6
+    seed: wp.uint32
+    faces: wp.array(dtype=wp.int32)  # [face of the tree] face of the scene; empty where they are the same
+
+
+@wp.struct
+class TransferResults:
+    transfer: wp.array2d(dtype=wp.float16)  # [slot, order^2] sr
+    hits: wp.array2d(dtype=wp.int32)  # [slot, bounce_rays] slot that the ray hits, SKY or BLACK
+    rays: wp.array(dtype=wp.int32)  # [slot] rays traced
+
+
+# Thread: a direction of a set. Cosine-distributed about z; the first 2^k of a set are well spread for every k.
+@wp.kernel
+def draw_directions(first: wp.int32, rays: TransferRays):
+    k = first + wp.tid()
+    seed = hash_uint(rays.seed + wp.uint32(k / rays.set_size))
+    d = cosine_direction(sample_2d(wp.uint32(k % rays.set_size), seed, DIRECTION_DIMENSION))
+    for axis in range(3):
+        rays.directions[axis, k] = d[axis]
+
+
+# The surface at a slot, seen from its side.
+@wp.func
+def slot_surface(scene: SceneData, slots: TransferSlots, slot: wp.int32) -> Surface:
+    face = slots.faces[slot]
+    ids = scene.geometry.indices[face]
+    p0 = scene.geometry.points[ids[0]]
+    normal = wp.normalize(wp.cross(scene.geometry.points[ids[1]] - p0, scene.geometry.points[ids[2]] - p0))
+    if wp.int32(slots.sides[slot]) == BACK:
+        normal = -normal
+    return surface_shape(scene, face, slots.points[slot][0], slots.points[slot][1], normal)
+
+
+# First direction of a slot's set.
+@wp.func
+def set_start(rays: TransferRays, slot: wp.int32) -> wp.int32:
+    return wp.int32(hash_uint(wp.uint32(slot) ^ hash_uint(rays.seed)) % wp.uint32(SETS)) * rays.set_size
+
+
+# world_from_local of a slot's directions: its shading frame, turned about the normal.
+@wp.func
+def set_frame(rays: TransferRays, shading: wp.mat33, slot: wp.int32) -> wp.mat33:
+    c = circle(random_1d(wp.uint32(slot), rays.seed, TURN_DIMENSION))
+    x = wp.vec3(shading[0, 0], shading[1, 0], shading[2, 0])
+    y = wp.vec3(shading[0, 1], shading[1, 1], shading[2, 1])
+    return wp.matrix_from_cols(
+        x * c[0] + y * c[1], y * c[0] - x * c[1], wp.vec3(shading[0, 2], shading[1, 2], shading[2, 2])
+    )
+
+
+@wp.func
+def ray_direction(rays: TransferRays, frame: wp.mat33, item: wp.int32) -> wp.vec3:
+    return frame * wp.vec3(rays.directions[0, item], rays.directions[1, item], rays.directions[2, item])
+
+
+# The slot that a ray hits, SKY or BLACK.
+@wp.func
+def hit_slot(
+    scene: SceneData, atlas: TransferAtlas, rays: TransferRays, origin: wp.vec3, direction: wp.vec3
+) -> wp.int32:
+    hit = bvh_intersect(scene.bvh, origin, direction, float(wp.inf))
+    if hit.face < 0:
+        return SKY
+    face = hit.face
+    if rays.faces.shape[0] > 0:
+        face = rays.faces[face]
+    slot = atlas_nearest(atlas, face, hit.u, hit.v, side_seen(scene, face, direction))
+    if slot < 0:
+        return BLACK
+    return slot
+
+
+# Traces `count` rays of a slot from number `begin` of its set on; returns a bit for each that reaches the sky.
+@wp.func
+def free_rays(
+    scene: SceneData,
+    atlas: TransferAtlas,
+    rays: TransferRays,
+    s: Surface,
+    slot: wp.int32,
+    begin: wp.int32,
+    count: wp.int32,
+    results: TransferResults,
+) -> wp.uint64:
+    frame = set_frame(rays, s.shading, slot)
+    item = set_start(rays, slot) + begin
+    origin = ray_origin(s)
+    free = wp.uint64(0)
+    for i in range(count):
+        direction = ray_direction(rays, frame, item + i)
+        target = int(BLACK)
+        if wp.dot(direction, s.normal) > 0.0:
+            if begin + i < rays.bounce_rays:
+                target = hit_slot(scene, atlas, rays, origin, direction)
+            elif bvh_occluded(scene.bvh, origin, direction, float(wp.inf)) == 0:
+                target = SKY
+        if begin + i < rays.bounce_rays:
+            results.hits[slot, begin + i] = target
+        if target == SKY:
+            free = free | (wp.uint64(1) << wp.uint64(i))
+    return free
+
+
+# Thread: a slot, from slot `start` on. Its rays, and its transfer T_j = pi/N sum_visible y_j(w), with the control
+# variate q (A_l y_j(n) - pi/N sum y_j(w)) of mean 0, where q is the share that is visible: where all is, T is exact.
+@wp.kernel
+def trace_transfer(
+    first: wp.int32,
+    start: wp.int32,
+    scene: SceneData,
+    atlas: TransferAtlas,
+    slots: TransferSlots,
+    rays: TransferRays,
+    results: TransferResults,
+):
+    slot = start + first + wp.tid()
+    s = slot_surface(scene, slots, slot)
+    frame = set_frame(rays, s.shading, slot)
+    item = set_start(rays, slot)
+    sums = Numbers()
+    seen = int(0)
+    done = int(0)
+    goal = int(rays.first_rays)
+    while done < goal:
+        count = wp.min(goal - done, BLOCK_RAYS)
+        free = free_rays(scene, atlas, rays, s, slot, done, count, results)
+        sums = sums + harmonic_sums(rays.directions, item + done, count, free, frame, rays.order)
+        seen += bit_count(free)
+        done += count
+        if done == rays.first_rays and seen > 0 and seen < done:
+            goal = rays.rays
+    results.rays[slot] = done
+    numbers = rays.order * rays.order
+    share = wp.float32(seen) / wp.float32(done)
+    exact = Numbers()
+    if seen > 0:
+        exact = open_transfer(shading_normal(s), rays.order) * share
+    if seen < done and seen > 0:
+        every = Numbers()
+        for block in range((done + BLOCK_RAYS - 1) / BLOCK_RAYS):
+            count = wp.min(done - block * BLOCK_RAYS, BLOCK_RAYS)
+            all = ~wp.uint64(0)
+            every = every + harmonic_sums(rays.directions, item + block * BLOCK_RAYS, count, all, frame, rays.order)
+        exact = exact + (sums - every * share) * (wp.pi / wp.float32(done))
+    for k in range(numbers):
+        results.transfer[slot, k] = wp.float16(exact[k])
+
+
+# Thread: a slot, from slot `start` on. Irradiance by the scene's emitters, from `samples` of them by power; or, where
+# `each` is set, from each of them once.
+@wp.kernel
+def light_slots(
+    first: wp.int32,
+    start: wp.int32,
+    scene: SceneData,
+    slots: TransferSlots,
+    samples: wp.int32,
+    each: wp.int32,
+    seed: wp.uint32,
+    result: wp.array(dtype=wp.vec3),
+):
+    slot = start + first + wp.tid()
+    s = slot_surface(scene, slots, slot)
+    origin = ray_origin(s)
+    n = shading_normal(s)
+    sum = wp.vec3()
+    for k in range(samples):
+        index = wp.uint32(slot) * wp.uint32(samples) + wp.uint32(k)
+        choice = LightChoice(k, 1.0, 1.0, 0, 0, 0.0)
+        if each == 0:
+            u = sample_1d(index, seed, LAMP_DIMENSION)
+            a = alias_choice(
+                scene.emitters.alias, scene.emitters.count, u, random_1d(index, seed, LAMP_DIGITS_DIMENSION)
+            )
+            choice.item = a.item
+            choice.pdf = a.pdf * wp.float32(samples)
+        e = sample_emitter(scene, origin, choice, sample_2d(index, seed, LAMP_POINT_DIMENSION))
+        cosine = wp.dot(e.direction, n)
+        if e.pdf > 0.0 and cosine > 0.0 and wp.dot(e.direction, s.normal) > 0.0:
+            if bvh_occluded(scene.bvh, origin, e.direction, e.distance * SHADOW_END) == 0:
+                if e.delta == 0:
+                    cosine = cosine / e.pdf
+                sum += e.radiance * cosine
+    result[slot] = sum
