@@ -1,14 +1,21 @@
-"""The G-buffer of an atlas: which face lies nearest to each texel, and where on it.
+"""The G-buffer of an atlas: which face lies nearest to each texel, where on it, and whether its back is in the open.
 
-Faces are binned on the host into tiles of TILE x TILE texels. A texel takes the nearest point that the faces of its tile
-have at most a texel away along each axis: just those texels are touched by bilinear fetches inside faces.
+Faces are binned on the host into tiles of TILE x TILE texels. A texel takes the nearest point that the faces of its
+tile have at most a texel away along each axis: just those texels are touched by bilinear fetches inside faces.
 """
 
 import warp as wp
 
+from warp_gi.kernels.bvh import bvh_intersect
+from warp_gi.kernels.sampling import OWN_DIMENSION, cosine_direction, frame_of, sample_2d
+from warp_gi.kernels.surface import ray_offset
+from warp_gi.kernels.transfer_atlas import FRONT, side_seen
+from warp_gi.kernels.types import Bvh, SceneData
+
 wp.set_module_options({"enable_backward": False})
 
 TILE = wp.constant(8)  # texels along a side
+INSIDE = wp.constant(0.1)  # share of the way to the centre of its face from which a slot's rays leave
 
 
 @wp.struct
@@ -99,3 +106,39 @@ def find_texel_faces(first: wp.int32, tiles: TransferTiles, texels: TransferTexe
             nearest = at[2]
             texels.faces[item] = face
             texels.points[item] = wp.vec2(at[0], at[1])
+
+
+@wp.struct
+class BackLooks:
+    faces: wp.array(dtype=wp.int32)  # [slot] on the fronts
+    points: wp.array(dtype=wp.vec2)  # [slot] barycentric coordinates u, v
+    faces_of_bvh: wp.array(dtype=wp.int32)  # [triangle of the tree] face of the scene
+    rays: wp.int32  # a slot
+    open: wp.array(dtype=wp.int32)  # [slot] rays from the back that met the sky, or the front of a face
+
+
+# Thread: a slot. Looks from the back of its face, a little inside its edges, and counts the rays that meet the sky or a
+# front: no ray does within a closed surface.
+@wp.kernel
+def look_behind(first: wp.int32, scene: SceneData, bvh: Bvh, looks: BackLooks):
+    slot = first + wp.tid()
+    face = looks.faces[slot]
+    ids = scene.geometry.indices[face]
+    a = scene.geometry.points[ids[0]]
+    b = scene.geometry.points[ids[1]]
+    c = scene.geometry.points[ids[2]]
+    back = -wp.normalize(wp.cross(wp.normalize(b - a), wp.normalize(c - a)))
+    at = looks.points[slot] * (1.0 - INSIDE) + wp.vec2(1.0, 1.0) * (INSIDE / 3.0)
+    position = a * (1.0 - at[0] - at[1]) + b * at[0] + c * at[1]
+    origin = position + back * ray_offset(position, scene.radius)
+    frame = frame_of(back)
+    count = int(0)
+    for k in range(looks.rays):
+        index = wp.uint32(slot) * wp.uint32(looks.rays) + wp.uint32(k)
+        direction = frame * cosine_direction(sample_2d(index, wp.uint32(0), OWN_DIMENSION))
+        hit = bvh_intersect(bvh, origin, direction, wp.inf)
+        if hit.face < 0:
+            count += 1
+        elif side_seen(scene, looks.faces_of_bvh[hit.face], direction) == FRONT:
+            count += 1
+    looks.open[slot] = count

@@ -97,7 +97,7 @@ def lamp_irradiance(work: TransferWork, scene: Scene, seed: int, progress: Progr
     result = filled((work.count,), wp.vec3, work.device)
 
     def run(start: int, slots: int) -> None:
-        inputs = [start, data, work.slots, samples, int(only_punctual), wp.uint32(seed & 0xFFFFFFFF), result]
+        inputs = [start, data, work.slots, samples, int(only_punctual), seed & 0xFFFFFFFF, result]
         launch.launch(ray_kernels.light_slots, slots, inputs, work.device, smallest_slice=16)
 
     work.each_batch(run, progress)
@@ -105,14 +105,20 @@ def lamp_irradiance(work: TransferWork, scene: Scene, seed: int, progress: Progr
 
 
 def gather_light(
-    work: TransferWork, traced: TracedTransfer, reflectance: np.ndarray, direct: np.ndarray, bounces: int, tolerance: float
+    work: TransferWork,
+    traced: TracedTransfer,
+    reflectance: np.ndarray,
+    direct: np.ndarray,
+    bounces: int,
+    tolerance: float,
 ) -> list[np.ndarray]:
     """Return the irradiance after each bounce of light that first arrives as ``direct`` [slots, 3], float32 each.
 
     Ends with the bounce that adds less than ``tolerance`` of all light, or after ``bounces`` (prt_textures.txt, 4.2).
     """
     hits = on_device(traced.hits, wp.int32, work.device)
-    total, found, last = float(np.abs(direct).sum(dtype=np.float64)), [], direct
+    found: list[np.ndarray] = []
+    total, last = float(np.abs(direct).sum(dtype=np.float64)), direct
     while len(found) < bounces and total > 0.0:
         result = filled((work.count,), wp.vec3, work.device)
         source = on_device((reflectance * last).astype(np.float32), wp.vec3, work.device)

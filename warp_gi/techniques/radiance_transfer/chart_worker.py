@@ -19,8 +19,9 @@ import xatlas
 CUT_TEXELS = 4.0
 """Texels a triangle, along a side, of the page on which xatlas lays out the charts of one part. Their size is that of
 ``charts.metric`` afterwards."""
-PADDING = 2
-"""Texels between charts, beyond those that a bilinear fetch touches."""
+PADDING = 1
+"""Texels between charts, beyond those that a bilinear fetch touches. With none, charts share such texels now and then;
+with two, a room of 5,000 charts has a third fewer texels on its surfaces."""
 UNITS_A_TEXEL = 64.0
 """Units of uv along about a texel, as xatlas gets them to pack: it drops triangles of an area below 1e-7 units^2."""
 NEAR = 0.97
@@ -35,8 +36,8 @@ def cut(points: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray
     atlas.add_mesh(points, indices)
     pack = xatlas.PackOptions()
     sides = points[indices[:, 1:]] - points[indices[:, :1]]
-    size = float(np.sqrt(0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum()))
-    pack.texels_per_unit = float(np.clip(CUT_TEXELS * np.sqrt(len(indices)), 64.0, 2048.0)) / size
+    area = float(0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum())
+    pack.texels_per_unit = float(np.clip(CUT_TEXELS * np.sqrt(len(indices)), 64.0, 2048.0) / np.sqrt(area))
     pack.rotate_charts_to_axis = True
     atlas.generate(xatlas.ChartOptions(), pack)
     if atlas.chart_count == 0:
@@ -56,12 +57,13 @@ def pack(uvs: np.ndarray, charts: np.ndarray, size: int, tell: Callable[[float],
     edges = (uvs[:, 1:] - uvs[:, :1]).astype(np.float64)
     first = size * np.sqrt(0.5 / max(float(0.5 * np.abs(np.linalg.det(edges)).sum()), 1e-30))
     uvs = (uvs * (UNITS_A_TEXEL * first)).astype(np.float32)
-    low, high, scale, best = 0.0, np.inf, 1.0, None
+    low, high, scale = 0.0, np.inf, 1.0
+    best, best_page = (np.zeros_like(uvs), np.zeros(len(uvs), bool)), np.zeros(0, np.int32)
     for attempt in range(MOST_PACKS):
         corners, is_placed, page = _packed(uvs, charts, scale / UNITS_A_TEXEL)
         got = max(page)
         if got <= size and scale > low:
-            low, best = scale, (corners, is_placed, page)
+            low, best, best_page = scale, (corners, is_placed), np.array(page, np.int32)
             if got >= NEAR * size:
                 break
         elif got > size:
@@ -70,9 +72,7 @@ def pack(uvs: np.ndarray, charts: np.ndarray, size: int, tell: Callable[[float],
         if not low < scale < high:
             scale = (low + min(high, 4.0 * low)) / 2.0 if low > 0.0 else high / 2.0
         tell((attempt + 1) / MOST_PACKS)
-    if best is None:
-        best = np.zeros_like(uvs), np.zeros(len(uvs), bool), ()
-    return {"corners": best[0], "is_placed": best[1], "page": np.array(best[2], np.int32)}
+    return {"corners": best[0], "is_placed": best[1], "page": best_page}
 
 
 def _packed(uvs: np.ndarray, charts: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
@@ -119,7 +119,7 @@ def run(job: Mapping[str, np.ndarray], tell: Callable[[float], None]) -> dict[st
 
 
 def main(folder: Path, seconds: float) -> None:
-    """Work off the job in a folder; the system ends the process by SIGPROF after ``seconds`` of CPU time, if above 0."""
+    """Work off the job in a folder; SIGPROF ends the process after ``seconds`` of CPU time, if that is above 0."""
     if seconds > 0.0 and hasattr(signal, "setitimer"):
         signal.signal(signal.SIGPROF, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_PROF, seconds)

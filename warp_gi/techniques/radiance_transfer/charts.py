@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import subprocess
@@ -15,12 +16,15 @@ from pathlib import Path
 import numpy as np
 
 from warp_gi.errors import OptionError
+from warp_gi.techniques.radiance_transfer.chart_cache import WORKER, cached
 
 Progress = Callable[[float], None]
 """Called with the share of the work that is done."""
 
 TRIANGLE_SIZE = 64.0
-"""Root of the mean area of a part's triangles as xatlas gets them: it drops those of an area below 1e-7, in any unit."""
+"""Root of the mean area of a part's triangles as xatlas gets them: it drops those with an area below 1e-7."""
+MOST_FACES = 16384
+"""Faces of a part that xatlas cuts at once: its time and memory grow faster than their number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +51,12 @@ class ChartJob:
 
     def run(self, job: dict[str, np.ndarray], progress: Progress | None = None) -> dict[str, np.ndarray]:
         """Return the worker's result; raises OptionError when the limit is over."""
-        worker = Path(__file__).with_name("chart_worker.py")
         left = max(self.limit - self.used, 1e-3) if self.limit > 0.0 else 0.0
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
         with tempfile.TemporaryDirectory(prefix="warp_gi_charts_") as name:
             folder = Path(name)
             np.savez(folder / "job.npz", **job)  # type: ignore[arg-type]
-            command = [sys.executable, "-s", str(worker), name, repr(left)]
+            command = [sys.executable, "-s", str(WORKER), name, repr(left)]
             with subprocess.Popen(
                 command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
             ) as process:
@@ -117,7 +120,7 @@ def surface_scales(points: np.ndarray, uvs: np.ndarray, charts: np.ndarray) -> n
 
 
 def plane_uvs(points: np.ndarray) -> np.ndarray:
-    """Return triangles [face, 3, 3] laid flat, float32 [face, 3, 2]: the first corner at 0, the second on the x axis."""
+    """Return triangles [face, 3, 3] laid flat, float32 [face, 3, 2]: first corner at 0, second on the x axis."""
     sides = (points[:, 1:] - points[:, :1]).astype(np.float64)
     length = np.linalg.norm(sides[:, 0], axis=1)
     along = (sides[:, 0] * sides[:, 1]).sum(axis=1) / length
@@ -132,12 +135,17 @@ def cut_charts(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return uv [face, 3, 2] and chart of each face, int32 [face], by xatlas; no chart is of two parts.
 
-    ``points`` float64 [face, 3, 3] are corners of faces that have an area, in any unit; ``parts`` are their parts,
-    rising from 0 without a gap.
+    ``points`` float64 [face, 3, 3] are corners of faces that have an area, in any unit; ``parts`` int32 [face] are
+    their parts, of which those of more than MOST_FACES faces are split.
     """
-    starts = np.searchsorted(parts, np.arange(parts[-1] + 2)) if len(parts) else np.zeros(1, np.int64)
+    if len(points) == 0:
+        return np.zeros((0, 3, 2), np.float32), np.zeros(0, np.int32)
+    parts = split_parts(points.mean(axis=1), parts)
+    order = np.argsort(parts, kind="stable")
+    points, parts = points[order], parts[order]
+    starts = np.searchsorted(parts, np.arange(parts[-1] + 2))
     all_points, all_indices, vertex_starts = [], [], [0]
-    for begin, end in zip(starts[:-1], starts[1:], strict=True):
+    for begin, end in itertools.pairwise(starts):
         corners = points[begin:end].reshape(-1, 3)
         sides = points[begin:end, 1:] - points[begin:end, :1]
         size = np.sqrt(0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).mean())
@@ -146,22 +154,43 @@ def cut_charts(
         all_points.append(vertices)
         all_indices.append(indices.reshape(-1, 3).astype(np.uint32))
         vertex_starts.append(vertex_starts[-1] + len(vertices))
-    if not all_points:
-        return np.zeros((0, 3, 2), np.float32), np.zeros(0, np.int32)
-    result = job.run(
-        {
-            "points": np.concatenate(all_points),
-            "indices": np.concatenate(all_indices),
-            "starts": starts,
-            "vertex_starts": np.array(vertex_starts),
-        },
-        progress,
-    )
-    return result["uvs"], result["charts"]
+    arrays = {
+        "points": np.concatenate(all_points),
+        "indices": np.concatenate(all_indices),
+        "starts": starts,
+        "vertex_starts": np.array(vertex_starts),
+    }
+    result = cached("cut", arrays, lambda: job.run(arrays, progress))
+    uvs, charts = np.empty_like(result["uvs"]), np.empty_like(result["charts"])
+    uvs[order], charts[order] = result["uvs"], result["charts"]
+    return uvs, charts
+
+
+def split_parts(centers: np.ndarray, parts: np.ndarray) -> np.ndarray:
+    """Return parts of at most MOST_FACES faces, int32 [face], from 0 without a gap: halves of halves of larger ones.
+
+    ``centers`` float64 [face, 3] and ``parts`` int32 [face] are those of the faces. A part is halved at the median of
+    its longest axis.
+    """
+    result, number = np.empty(len(parts), np.int32), 0
+    order = np.argsort(parts, kind="stable")
+    stack = np.split(order, np.flatnonzero(np.diff(parts[order])) + 1)[::-1]
+    while stack:
+        faces = stack.pop()
+        if len(faces) > MOST_FACES:
+            axis = int(np.argmax(np.ptp(centers[faces], axis=0)))
+            by_axis = faces[np.argsort(centers[faces, axis], kind="stable")]
+            stack += [by_axis[len(faces) // 2 :], by_axis[: len(faces) // 2]]
+            continue
+        result[faces] = number
+        number += 1
+    return result
 
 
 def surface_sized(points: np.ndarray, uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return uv as large as the surface, and charts: faces of a chart without area in uv get one each."""
+    if len(points) == 0:
+        return uvs, charts
     scales = surface_scales(points, uvs, charts)
     is_flat = charts < 0
     is_flat[~is_flat] = (scales[charts[~is_flat]] == 0.0).any(axis=1)
@@ -178,8 +207,11 @@ def packed(uvs: np.ndarray, charts: np.ndarray, size: int, job: ChartJob, progre
 
     Raises OptionError if they do not fit.
     """
+    if len(uvs) == 0:
+        return Page(uvs, charts, 0, 0)
     count = int(charts.max(initial=-1)) + 1
-    result = job.run({"uvs": uvs, "charts": charts, "size": np.array(size)}, progress)
+    arrays = {"uvs": uvs, "charts": charts, "size": np.array(size)}
+    result = cached("page", arrays, lambda: job.run(arrays, progress))
     if len(result["page"]) == 0:
         raise OptionError(
             f"resolution {size} is too small for the {count:,} charts of this scene; take a larger resolution, or keep"

@@ -84,7 +84,7 @@ def transfer_rays(scene: Scene, settings: TransferSettings, device: wp.Device, s
     rays.bounce_rays = settings.bounce_rays if settings.bounces > 0 else 0
     rays.first_rays = max(min(settings.first_rays, settings.rays), rays.bounce_rays)
     rays.rays = max(settings.rays, rays.first_rays)
-    rays.order, rays.seed = settings.order, wp.uint32(seed & 0xFFFFFFFF)
+    rays.order, rays.seed = settings.order, seed & 0xFFFFFFFF
     rays.set_size = rays.rays
     count = int(kernels.SETS) * rays.set_size
     rays.directions = wp.zeros((3, count + 8), dtype=wp.float32, device=device)
@@ -114,6 +114,6 @@ def trace_slots(work: TransferWork, progress: Progress | None = None) -> TracedT
 
 
 def filled(shape: tuple[int, ...], dtype: Any, device: wp.Device) -> wp.array:
-    """Return an array of zeros [shape] of ``dtype``, in memory that NumPy allocated if on the CPU: see ``on_device``."""
+    """Return zeros [shape] of ``dtype``, on the CPU in memory that NumPy allocated: see ``on_device``."""
     scalar, size = (wp.float32, (dtype._length_,)) if dtype in (wp.vec2, wp.vec3) else (dtype, ())
     return on_device(np.zeros((*shape, *size), wp.dtype_to_numpy(scalar)), dtype, device)
