@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from numbers import Integral
 from typing import Any
 
@@ -111,9 +111,10 @@ class Pipeline:
             for service in part.services:
                 service = self._settings_of(service)
                 gather(service.name, service)
-                if found.setdefault(service.name, service) != service:
+                if (known := found.setdefault(service.name, service)) != service:
                     raise OptionError(
-                        f"{place} asks for the service {service.name!r} with other settings than others do"
+                        f"{place} asks for the service {service.name!r} with other settings than others do "
+                        f"({_differing(service, known)}): make them equal"
                     )
 
         for place, part in (*self.radiance_caches(), *self.estimators()):
@@ -248,6 +249,17 @@ def estimator_named(term: str, name: str) -> Estimator:
         raise unknown_name(f"{term} estimator", name, of_term)
     takes_term = any(one.name == "term" for one in fields(classes[name]))  # one that serves several
     return classes[name](term=term) if takes_term else classes[name]()
+
+
+def _differing(one: Any, other: Any) -> str:
+    """Return the settings in which two dataclasses differ, those within settings by their own names."""
+    found = []
+    for name in (each.name for each in fields(one)):
+        mine, theirs = getattr(one, name), getattr(other, name, None)
+        if mine != theirs:
+            both = is_dataclass(mine) and type(mine) is type(theirs)
+            found.append(_differing(mine, theirs) if both else f"{name} {mine!r}, others {theirs!r}")
+    return "; ".join(found) or f"{type(one).__name__}, others {type(other).__name__}"
 
 
 def _is_whole(estimator: Estimator) -> bool:

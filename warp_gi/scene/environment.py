@@ -25,12 +25,13 @@ import warp as wp
 
 from warp_gi.alias import AliasTable
 from warp_gi.color import LUMINANCE, decode_srgb
-from warp_gi.errors import SceneError, one_line
+from warp_gi.errors import OptionError, SceneError, one_line
 from warp_gi.kernels import types
 from warp_gi.launch import get_device, on_device
 from warp_gi.scene import harmonics
 from warp_gi.scene.model import Color
 from warp_gi.scene.sky import SunSky, node_solid_angles
+from warp_gi.scene.sun import MOST_SUNS, MapSplit, SunSplit, split_map
 from warp_gi.scene.watching import Watch
 
 __all__ = ["Environment", "SunSky", "as_environment"]
@@ -47,6 +48,7 @@ class SkyMap:
         self.arrays: dict[str, tuple[wp.array, wp.array, float]] = {}
         self.watch: Watch | None = None
         self._harmonics: dict[int, np.ndarray] = {}
+        self._splits: dict[tuple[float, int], tuple[MapSplit, SkyMap]] = {}
 
     @cached_property
     def digest(self) -> bytes:
@@ -64,6 +66,14 @@ class SkyMap:
             self._harmonics[order] = harmonics.project(self.pixels, order)
             self._harmonics[order].flags.writeable = False
         return self._harmonics[order]
+
+    def split(self, brighter_than: float, most: int) -> tuple[MapSplit, SkyMap]:
+        """Return the map's suns, and the map without them."""
+        key = brighter_than, most
+        if key not in self._splits:
+            parts = split_map(self.pixels, brighter_than, most)
+            self._splits[key] = parts, self if parts.pixels is self.pixels else SkyMap(parts.pixels)
+        return self._splits[key]
 
     def on(self, device: wp.Device) -> tuple[wp.array, wp.array, float]:
         """Return texels, alias table and scale of densities, arrays on the device."""
@@ -175,6 +185,32 @@ class Environment:
             result[:, 0] = self.mean_radiance * math.sqrt(4 * math.pi)
             return result
         return harmonics.rotate(self._map.harmonics_of(order), self.world_from_environment) * self.scale
+
+    def split_sun(self, brighter_than: float = 20.0, most: int = MOST_SUNS) -> SunSplit:
+        """Return the suns of this sky and the rest of it; a constant sky has none.
+
+        A map is searched once; another rotation or scale of it costs next to nothing, and so do the rest's harmonics.
+
+        Args:
+            brighter_than: A sun is brighter than so many times the sky's mean (by luminance), and is cut off there.
+            most: Largest number of suns; the brightest are taken, if they hold a share of ``sun.LEAST_SHARE`` each.
+
+        Raises:
+            OptionError: for numbers out of range.
+        """
+        if not (math.isfinite(brighter_than) and brighter_than > 1):
+            raise OptionError(f"split_sun: brighter_than must be a number above 1, got {brighter_than}")
+        if most < 0:
+            raise OptionError(f"split_sun: most must not be negative, got {most}")
+        if self._map is None or self.scale == 0:
+            return SunSplit(self, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), 0.0)
+        parts, rest = self._map.split(brighter_than, most)
+        directions = parts.directions @ self.world_from_environment.T
+        sky = self
+        if rest is not self._map:
+            sky = Environment(rest.pixels, None, self.rotation, self.scale, self.name, rest)
+        irradiances = parts.irradiances * self.scale
+        return SunSplit(sky, directions, irradiances, parts.cos_cones, parts.cos_discs, parts.share)
 
     @property
     def content_hash(self) -> str:

@@ -1,0 +1,153 @@
+"""RadianceTransfer in a pipeline: terms that share a bake, skies that change, paths that end in it, what moves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import statistics_tools as st
+from scene_tools import quad, sphere
+from truth_tools import sky_of
+
+import warp_gi as gi
+from warp_gi import launch
+
+BAKE = {"resolution": 96, "rays": 256}
+DIRECT = gi.RadianceTransfer(**BAKE)
+INDIRECT = replace(DIRECT, term="indirect")
+GREY = gi.Material("grey", (0.6, 0.5, 0.4), specular=0.0)
+RED = gi.Material("red", (0.7, 0.1, 0.1), specular=0.0)
+
+
+def corner(sky: object = None, *more: gi.Node) -> gi.Scene:
+    """Return a floor, a red wall and a ball."""
+    meshes = [
+        quad((-1, 0, 1), (2, 0, 0), (0, 0, -2), GREY, "floor"),
+        quad((-1, 0, -1), (2, 0, 0), (0, 1, 0), RED, "wall"),
+        sphere((0.4, 0.3, 0.2), 0.3, GREY, rows=8),
+    ]
+    return gi.Scene([gi.Node("corner", meshes), *more], environment=sky, name="corner")
+
+
+def view(resolution: tuple[int, int] = (48, 32)) -> gi.Camera:
+    return gi.Camera.look_at((0.5, 1.2, 2.2), (0.0, 0.25, -0.2), hfov=50, resolution=resolution)
+
+
+def slope(directions: np.ndarray) -> np.ndarray:
+    """Return a smooth sky: bright above and to one side, red there."""
+    x, y, z = directions.T
+    return np.stack([1.2 + 0.8 * y + 0.5 * x, 1.0 + 0.8 * y - 0.2 * x * z, 1.0 + 0.6 * y * y], axis=-1)
+
+
+def pipeline(**settings: object) -> gi.Pipeline:
+    return gi.Pipeline.preset("transfer", **{"environment": DIRECT, "indirect": INDIRECT, "spp": 4, **settings})
+
+
+def rendered(scene: gi.Scene, used: gi.Pipeline, **more: object) -> gi.Frame:
+    return next(gi.render(scene, view(), used, device=st.device().alias, **more))
+
+
+def test_it_agrees_with_paths_under_a_smooth_sky():
+    scene = corner(sky_of(slope))
+    frame, truth = rendered(scene, pipeline()), rendered(scene, gi.Pipeline(spp=1024))
+    hit = truth.numpy("object_id") >= 0
+    for term, bound in (("environment", 0.03), ("indirect", 0.12)):
+        mine, known = frame.numpy(term)[hit], truth.numpy(term)[hit]
+        assert mine.mean() == pytest.approx(known.mean(), rel=0.02), term
+        assert np.sqrt(((mine - known) ** 2).mean()) / known.mean() < bound, term
+
+
+def test_a_turned_sky_is_the_sky_of_a_turned_map():
+    """The bake is the same; the picture under a turned sky is that of its own map's, and others differ."""
+    bake = gi.bake(corner(), DIRECT, st.device().alias)
+    sky = sky_of(slope)
+    angle = np.radians(70.0)
+    turned = sky_of(
+        lambda d: slope(
+            d @ np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+        )
+    )
+    one = rendered(corner(sky.rotated(70.0)), pipeline(), bakes=[bake]).numpy("beauty")
+    other = rendered(corner(turned), pipeline(), bakes=[bake]).numpy("beauty")
+    still = rendered(corner(sky), pipeline(), bakes=[bake]).numpy("beauty")
+    hit = rendered(corner(sky), pipeline(), bakes=[bake]).numpy("object_id") >= 0
+    np.testing.assert_allclose(one[hit], other[hit], rtol=2e-3)
+    assert abs(one - still)[hit].mean() > 0.01 * still[hit].mean()
+
+
+def test_terms_with_other_bakes_are_refused():
+    with pytest.raises(gi.OptionError, match=r"other settings than others do \(resolution 64, others 96\): make them"):
+        gi.FrameScheduler(corner(1.0), view(), pipeline(indirect=replace(INDIRECT, resolution=64)))
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({"term": "emitters"}, "unknown term 'emitters'"),
+        ({"order": 4}, "order must be 5 or 6, got 4"),
+        ({"rays": 16}, r"rays must be at least first_rays \(64\), got 16"),
+        ({"resolution": 8}, "resolution must be a whole number from 16 to 16384, got 8"),
+        ({"sun": float("nan")}, "sun must be finite and not negative, got nan"),
+        ({"storage": "voxels"}, "unknown storage 'voxels'"),
+    ],
+)
+def test_settings_out_of_range(settings, told):
+    with pytest.raises(gi.OptionError, match=told):
+        gi.RadianceTransfer(**settings)
+
+
+def test_threads_saving_and_one_launch_change_no_bit(tmp_path, monkeypatch):
+    scene = corner(sky_of(slope))
+    used = pipeline(emitters=None)
+    bake = gi.bake(scene, DIRECT, st.device().alias)
+    first = rendered(scene, used, bakes=[bake])
+    loaded = gi.Bake.load(bake.save(tmp_path / "a.safetensors"))
+    again = rendered(scene, used, bakes=[loaded])
+    monkeypatch.setattr(launch, "thread_count", lambda: 1)
+    alone = rendered(scene, used)
+    apart = [rendered(scene, replace(used, **{term: None}), bakes=[bake]) for term in ("environment", "indirect")]
+    for name in ("environment", "indirect", "beauty", "variance"):
+        assert (first.numpy(name) == again.numpy(name)).all() and (first.numpy(name) == alone.numpy(name)).all(), name
+    assert (apart[1].numpy("environment") == first.numpy("environment")).all()
+    assert (apart[0].numpy("indirect") == first.numpy("indirect")).all()
+
+
+def test_one_bake_serves_both_terms_in_one_piece_of_memory():
+    scheduler = gi.FrameScheduler(corner(1.0), view(), pipeline(), st.device().alias)
+    assert scheduler.state("environment") is scheduler.state("indirect")
+    assert pipeline().dependence(corner(1.0)).kind == "independent"
+
+
+def test_paths_end_in_it():
+    """A traced first bounce that ends in the textures has the light of long paths, and less noise."""
+    scene = corner(sky_of(slope))
+    ends = gi.Pipeline(environment=None, emitters=None, indirect=gi.BsdfPaths(ends_in=DIRECT), spp=16)
+    plain = replace(ends, indirect=gi.BsdfPaths())
+    truth = rendered(scene, replace(plain, spp=2048)).numpy("indirect")
+    errors = {}
+    for name, used in (("ends", ends), ("plain", plain)):
+        picture = rendered(scene, used).numpy("indirect")
+        assert picture.mean() == pytest.approx(truth.mean(), rel=0.03), name
+        errors[name] = ((picture - truth) ** 2).mean()
+    assert errors["ends"] < errors["plain"]
+
+
+def flying(sky: object) -> gi.Scene:
+    """Return the corner with a card above it that moves."""
+    card = gi.Node("card", [quad((-0.4, 0, 0.4), (0.8, 0, 0), (0, 0, -0.8), RED, "card")])
+    scene = corner(sky, card)
+    scene.animate("card", [gi.Keyframe(0.0, (0, 0.8, 0)), gi.Keyframe(1.0, (0, 0.8, 0.4))])
+    return scene
+
+
+def test_what_moves_receives_light():
+    """Its own light is path traced; it is not in the bake, and a warning says so."""
+    scene = flying(sky_of(slope))
+    with pytest.warns(UserWarning, match="knows nothing of what moves: 'card'"):
+        frame = rendered(scene, pipeline(spp=64))
+    truth = rendered(scene, gi.Pipeline(spp=1024))
+    card = (truth.numpy("object_id") == 1) & (frame.numpy("object_id") == 1)
+    assert card.sum() > 20
+    for term in ("environment", "indirect"):
+        assert frame.numpy(term)[card].mean() == pytest.approx(truth.numpy(term)[card].mean(), rel=0.05), term

@@ -1,0 +1,140 @@
+"""Suns of a sky: the few small bright blobs of a map, apart from the rest of it.
+
+What is brighter than so many times the mean leaves the map, which is cut at that radiance there, and becomes one lamp a
+blob of neighbouring texels. The rest is a sky like others: never negative, and smoother.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from warp_gi.color import LUMINANCE
+from warp_gi.scene.sky import node_solid_angles
+
+if TYPE_CHECKING:
+    from warp_gi.scene.environment import Environment
+
+MOST_SUNS = 8
+"""Largest number of suns; what is left over stays in the map."""
+LEAST_SHARE = 0.002
+"""Share of the sky's light that a blob has to hold, or it stays in the map."""
+LAMPS_SHARE = 0.5
+"""Share of the sky's light that suns hold where a sky counts as one of a few lamps."""
+
+
+@dataclass(frozen=True, eq=False)
+class SunSplit:
+    """A sky in two parts, which add up to the whole: its suns, and the rest."""
+
+    rest: Environment
+    """The sky without its suns; the sky itself where there are none."""
+    directions: np.ndarray
+    """Unit directions towards the suns in world space, brightest first, float64 [suns, 3]."""
+    irradiances: np.ndarray
+    """Irradiance of a surface that faces a sun, W/m^2, float64 [suns, 3]: the integral of what left the map."""
+    cos_cones: np.ndarray
+    """Cosines of the half-angles of cones that hold all light of each sun, float64 [suns]."""
+    cos_discs: np.ndarray
+    """Cosines of the half-angles of even discs as wide as each sun (of the same second moment), float64 [suns]."""
+    share: float
+    """Share of the sky's light (luminance, from all directions) that the suns hold."""
+
+    @property
+    def warning(self) -> str | None:
+        """One line for those to whom the rest is what counts, where the suns hold most of the light; else None."""
+        if self.share <= LAMPS_SHARE:
+            return None
+        return (
+            f"{self.rest.name}: {len(self.directions)} small lamps hold {self.share:.0%} of this sky's light;"
+            " as spherical harmonics it is a poor likeness, and is better traced"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class MapSplit:
+    """What a SunSplit is made of: the parts of a map, in its own space and unscaled."""
+
+    pixels: np.ndarray
+    """The rest, float32 [height, width, 3]; the map itself where there are no suns."""
+    directions: np.ndarray
+    irradiances: np.ndarray
+    cos_cones: np.ndarray
+    cos_discs: np.ndarray
+    share: float
+
+
+def split_map(pixels: np.ndarray, brighter_than: float, most: int) -> MapSplit:
+    """Return the suns of a map [height, width, 3] and the rest; ``Environment.split_sun`` says what counts as one.
+
+    A texel that is cut keeps its colour. Blobs touch at sides or corners, across the edge of the map, too, and a
+    pole is one point that all of the next row touches.
+    """
+    height, width = pixels.shape[:2]
+    areas = node_solid_angles(height, width)
+    luminance = pixels @ LUMINANCE
+    whole = float(areas @ luminance.sum(axis=1))
+    limit = brighter_than * whole / (4 * math.pi)
+    rows, columns = np.nonzero(luminance > limit)
+    none = MapSplit(pixels, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), 0.0)
+    if len(rows) == 0 or whole == 0:
+        return none
+    bright = pixels[rows, columns]
+    cut = (bright * (limit / luminance[rows, columns])[:, None]).astype(np.float32)
+    light = (bright.astype(np.float64) - cut) * areas[rows, None]
+    blobs = _blobs(rows, columns, height, width)
+    powers = np.bincount(blobs, light @ LUMINANCE)
+    suns = [k for k in np.argsort(-powers, kind="stable")[:most] if powers[k] >= LEAST_SHARE * whole]
+    if not suns:
+        return none
+    rest = pixels.copy()
+    theta, phi = rows * (math.pi / (height - 1)), (columns + 0.5) * (2 * math.pi / width)
+    towards = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=-1)
+    step = math.hypot(math.pi / (height - 1), 2 * math.pi / width)  # a texel's light reaches to the next, every way
+    directions, irradiances, cones, discs = [], [], [], []
+    for k in suns:
+        held = blobs == k
+        rest[rows[held], columns[held]] = cut[held]
+        weights = light[held] @ LUMINANCE
+        axis = weights @ towards[held]
+        axis /= np.linalg.norm(axis)
+        cosines = np.clip(towards[held] @ axis, -1, 1)
+        cone = min(math.acos(cosines.min()) + step, math.pi)
+        # the mean of sin^2 over an even disc is half that at its rim; a texel's own light has step^2 / 6
+        spread = 2 * (weights @ (1 - cosines**2) / weights.sum() + step**2 / 6)
+        directions.append(axis)
+        irradiances.append(light[held].sum(axis=0))
+        cones.append(math.cos(cone))
+        discs.append(max(math.sqrt(max(1 - spread, 0.0)), cones[-1]))
+    share = float(powers[suns].sum() / whole)
+    return MapSplit(rest, np.array(directions), np.array(irradiances), np.array(cones), np.array(discs), share)
+
+
+def _blobs(rows: np.ndarray, columns: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Return the number of the blob, from 0, to which each texel of a list (in order of the map) belongs, int [n]."""
+    count = len(rows)
+    place = rows * width + columns
+    pairs = []
+    for down, right in ((0, 1), (1, -1), (1, 0), (1, 1)):
+        wanted = (rows + down) * width + (columns + right) % width
+        found = np.minimum(np.searchsorted(place, wanted), count - 1)
+        near = (place[found] == wanted) & (rows + down < height)
+        pairs.append(np.stack([np.nonzero(near)[0], found[near]]))
+    for pole, beside in ((0, 1), (height - 1, height - 2)):  # all texels of a pole are one point
+        if (rows == pole).any():
+            there = np.nonzero((rows == pole) | (rows == beside))[0]
+            pairs.append(np.stack([there[:-1], there[1:]]))
+    a, b = np.concatenate(pairs, axis=1)
+    label = np.arange(count)
+    while True:  # the smallest number wins: along pairs, and then along chains of numbers
+        low = np.minimum(label[a], label[b])
+        changed = label.copy()
+        np.minimum.at(changed, label[a], low)
+        np.minimum.at(changed, label[b], low)
+        changed = changed[changed]
+        if np.array_equal(changed, label):
+            return np.unique(label, return_inverse=True)[1].reshape(-1)
+        label = changed
