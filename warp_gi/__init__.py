@@ -30,6 +30,7 @@ _PUBLIC = {
     "load_scene": "warp_gi.scene.loading",
     "Environment": "warp_gi.scene.environment",
     "SunSky": "warp_gi.scene.environment",
+    "SkySequence": "warp_gi.scene.sky_motion",
     "TurningSky": "warp_gi.scene.sky_motion",
     "builtin_scene": "warp_gi.scene.builtin",
     "Camera": "warp_gi.scene.pinhole",

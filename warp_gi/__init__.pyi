@@ -41,6 +41,7 @@ from warp_gi.scene.model import PunctualLight as PunctualLight
 from warp_gi.scene.model import Texture as Texture
 from warp_gi.scene.pinhole import Camera as Camera
 from warp_gi.scene.scene import Scene as Scene
+from warp_gi.scene.sky_motion import SkySequence as SkySequence
 from warp_gi.scene.sky_motion import TurningSky as TurningSky
 from warp_gi.scheduler import FrameScheduler as FrameScheduler
 from warp_gi.sequence.frames import read_frame as read_frame

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all, and files with a number in their name."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+
+from warp_gi.errors import OptionError
 
 
 @contextlib.contextmanager
@@ -56,6 +58,34 @@ def remove_stale_parts(path: str | Path) -> None:
         match = name.fullmatch(candidate.name)
         if match and (int(match[1]) == os.getpid() or not _is_running(int(match[1]))):
             _remove(candidate)
+
+
+def frame_path(pattern: str | Path, index: int) -> Path:
+    """Return the file of frame ``index``: the last run of ``#`` in the name becomes the zero-padded number.
+
+    A name without ``#`` is returned as it is. Raises OptionError for a negative index.
+    """
+    if index < 0:
+        raise OptionError(f"frame numbers start at 0, got {index}")
+    pattern = Path(pattern)
+    runs = list(re.finditer("#+", pattern.name))
+    if not runs:
+        return pattern
+    start, end = runs[-1].span()
+    return pattern.with_name(f"{pattern.name[:start]}{index:0{end - start}d}{pattern.name[end:]}")
+
+
+def frames_there(pattern: str | Path) -> list[int]:
+    """Return the numbers, in order, for which ``frame_path`` names a file that is there."""
+    pattern = Path(pattern)
+    runs = list(re.finditer("#+", pattern.name))
+    if not runs or not pattern.parent.is_dir():
+        return []
+    start, end = runs[-1].span()
+    name = re.compile(rf"{re.escape(pattern.name[:start])}(\d+){re.escape(pattern.name[end:])}")
+    found = (name.fullmatch(path.name) for path in pattern.parent.iterdir())
+    numbers = {int(match[1]) for match in found if match}
+    return sorted(number for number in numbers if frame_path(pattern, number).is_file())
 
 
 def _remove(part: Path) -> None:

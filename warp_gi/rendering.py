@@ -10,6 +10,7 @@ from warp_gi.errors import OptionError
 from warp_gi.estimator import Estimator
 from warp_gi.pipeline import Pipeline
 from warp_gi.scene.camera import Camera, CameraPath
+from warp_gi.scene.sky_motion import sky_start
 from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence.resume import Output, Plan, SequenceRun, shots_of
 from warp_gi.stateful import Stateful
@@ -133,7 +134,8 @@ def bake(
     """Return what an estimator can know of a scene before the first frame, to be saved and used again.
 
     Args:
-        scene: What will be rendered. It is baked as it is at time 0, its sky too.
+        scene: What will be rendered. It is baked as it is at time 0, its sky too; or the first one that a
+            sky of numbered files has.
         estimator: An estimator or a radiance cache, for example ``gi.VisibilityField(cell_size=0.5)``.
         device: "cpu", "cuda", "cuda:1".
         seed: Every random number follows from it.
@@ -150,7 +152,7 @@ def bake(
     told = (lambda share: progress("bake", share)) if progress else None
     with scene.lock:
         scene.check_unchanged()
-        scene.update_sky(0.0)
+        scene.update_sky(sky_start(scene.sky_at))
         scene.update(0.0, None, device)
         result = estimator.bake(scene, device, seed, told, camera)
     if result is None and isinstance(estimator, Estimator) and estimator.radiance_cache is not None:

@@ -24,6 +24,7 @@ from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.camera import Camera, CameraPath, frame_time
 from warp_gi.scene.scene import Scene
+from warp_gi.scene.sky_motion import sky_start
 from warp_gi.sequence.state import Dependence, state_arrays, with_arrays
 from warp_gi.stateful import Ahead, Stateful
 
@@ -101,7 +102,7 @@ class FrameScheduler:
             self._start_part(DENOISER, self.pipeline.denoise)
         self._bake_seconds = 0.0
         self._baked_version = -1
-        self._sky_time = 0.0
+        self._sky_time = sky_start(self.scene.sky_at)
         self._scene_hash = ""
 
     # ---- before the first frame ----
@@ -112,7 +113,7 @@ class FrameScheduler:
 
         Done afresh when the scene got another environment or animation, for every part that depends on it: the others
         keep their states. ``sky_time`` is the time in seconds of a sky that is a function of time: that of the first
-        frame. None is that of the last frame, or 0 before any.
+        frame. None is that of the last frame, or the sky's first one before any.
         """
         self._sky_time = self._sky_time if sky_time is None else sky_time
         self.scene.update_sky(self._sky_time)  # whoever rendered another time of the scene since

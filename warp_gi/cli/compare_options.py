@@ -15,6 +15,7 @@ from warp_gi.cli.inputs import (
     SceneOptions,
     find_camera,
     find_scene,
+    move_sky,
     parse_resolution,
 )
 from warp_gi.cli.options import flag, parse_options
@@ -23,7 +24,7 @@ from warp_gi.cli.report import Reporter, start_warp
 from warp_gi.errors import OptionError, check_whole
 from warp_gi.files import check_writable
 from warp_gi.pipeline import MOST_SAMPLES, Pipeline
-from warp_gi.scene.camera import Camera, CameraPath
+from warp_gi.scene.camera import Camera, CameraPath, frame_time
 from warp_gi.scene.scene import Scene
 
 DESCRIPTION = """Compare pipelines on a scene: errors at equal samples and at equal time, time at equal error.
@@ -111,6 +112,10 @@ def inputs_of(options: CompareBench, report: Reporter | None = None) -> Inputs:
     """Return scene, still camera and pipelines; raises SceneError or OptionError."""
     scene = find_scene(options)
     camera = find_camera(options, scene, report or Reporter(quiet=True))
+    if scene.sky_at is not None:  # one moment is compared, its sky stands still
+        move_sky(scene, 0.0, camera, [options.frame])
+        scene.update_sky(frame_time(camera, options.frame))
+        scene.environment = scene.environment
     if isinstance(camera, CameraPath):
         camera = camera.camera(options.frame)
     camera = camera.at_resolution(*parse_resolution(options.size or SIZE))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,10 +16,11 @@ from warp_gi.cli.options import flag
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.builtin import BUILTIN_SCENES, builtin_camera_path, builtin_scene
-from warp_gi.scene.camera import Camera, CameraPath
+from warp_gi.scene.camera import STILL_FPS, Camera, CameraPath
 from warp_gi.scene.environment import Environment, SunSky, as_environment
 from warp_gi.scene.loading import load_scene
 from warp_gi.scene.scene import Scene
+from warp_gi.scene.sky_motion import SkySequence, TurningSky
 
 if TYPE_CHECKING:
     from warp_gi.cli.report import Reporter
@@ -38,7 +40,8 @@ class SceneOptions:
     scale: float = 1.0
     """Length in metres of one unit of the file."""
     environment: Annotated[str, flag("SKY", "the scene's own; files: none")] = ""
-    """Sky of the scene: a latitude-longitude EXR or HDR file, a radiance R,G,B, sun-sky, or none."""
+    """Sky of the scene: a latitude-longitude EXR or HDR file, a radiance R,G,B, sun-sky, or none. In sky.####.exr the
+    frame's number takes the place of ####, so that each frame has a sky of its own."""
     environment_rotation: float = 0.0
     """Angle in degrees by which the sky is turned about +y, counter-clockwise seen from above."""
     environment_scale: float = 1.0
@@ -75,9 +78,11 @@ def find_scene(options: SceneOptions) -> Scene:
     return scene
 
 
-def parse_environment(options: SceneOptions) -> Environment:
+def parse_environment(options: SceneOptions) -> Environment | SkySequence:
     """Return the sky that ``--environment`` names."""
     text = options.environment
+    if "#" in Path(text).name and not Path(text).is_file():
+        return SkySequence(text, STILL_FPS, options.environment_rotation, options.environment_scale)
     numbers = re.split(r"[,\s]+", text.strip())
     if text == "none":
         sky = as_environment(None)
@@ -93,6 +98,24 @@ def parse_environment(options: SceneOptions) -> Environment:
     if options.environment_scale != 1.0:
         sky = replace(sky, scale=sky.scale * options.environment_scale)
     return sky.rotated(options.environment_rotation)
+
+
+def move_sky(scene: Scene, turn: float, camera: Camera | CameraPath, frames: Iterable[int]) -> None:
+    """Let a sky change from frame to frame of a camera: by a file a frame, and turned by ``turn`` degrees a frame.
+
+    Raises OptionError for a turn that cannot be, SceneError for frames that a sequence of skies has no file for.
+    """
+    if not math.isfinite(turn):
+        raise OptionError(f"--environment-turn must be a finite number of degrees, got {turn:g}")
+    if turn and scene.environment is None:
+        raise OptionError(f"--environment-turn needs a sky to turn, and {scene.name} has none; give --environment too")
+    fps = camera.fps if isinstance(camera, CameraPath) else STILL_FPS
+    sky = scene.sky_at or scene.environment
+    if isinstance(sky, SkySequence):
+        sky = replace(sky, fps=fps)
+        sky.check(frames)
+    if turn or sky is not scene.environment:
+        scene.environment = TurningSky(sky, turn, fps) if turn else sky
 
 
 def find_camera(options: SceneOptions, scene: Scene | BakedScene, report: Reporter) -> Camera | CameraPath:

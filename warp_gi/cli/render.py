@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -19,6 +18,7 @@ from warp_gi.cli.inputs import (
     SceneOptions,
     find_camera,
     find_scene,
+    move_sky,
     parse_resolution,
 )
 from warp_gi.cli.interrupts import stoppable
@@ -30,9 +30,8 @@ from warp_gi.files import check_writable
 from warp_gi.frame import Frame
 from warp_gi.pipeline import Pipeline
 from warp_gi.scene.baked import BakedScene
-from warp_gi.scene.camera import STILL_FPS, Camera, CameraPath
+from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.scene import Scene
-from warp_gi.scene.sky_motion import TurningSky
 from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence.frames import parse_frames
 from warp_gi.sequence.resume import Output, Plan, SequenceRun, Shot, shots_of
@@ -47,6 +46,7 @@ all: stop with Ctrl-C or kill the process at any time, and carry on with --resum
   warp-gi render hall.glb --environment city.exr --camera path.json --frames 0-47 --spp 64
   warp-gi render hall.glb --eye 4 1.7 2 --target -3 1.6 -0.5 -o out/still.exr --preview
   warp-gi render hall.glb --pipeline dvf --bake out/hall.dvf.safetensors --environment-turn 2
+  warp-gi render hall.glb --environment sky.####.exr --camera path.json --frames 0-47
   warp-gi render hall.glb --pipeline probes --denoise spatiotemporal
   warp-gi render out/hall.probes.safetensors --camera path.json
   warp-gi render warehouse --pipeline reuse --reuse-pictures out/reuse --reuse-pixel 320 300
@@ -130,7 +130,8 @@ def run(options: Render, report: Reporter) -> None:
         camera = camera.at_resolution(*resolution)
     describe(options, scene, report)
     shots = find_shots(options, camera)
-    turn_sky(options, scene, camera)
+    if isinstance(scene, Scene):
+        move_sky(scene, options.environment_turn, camera, [shot.index for shot in shots])
     source = scene.bake if isinstance(scene, BakedScene) else scene
     scheduler = FrameScheduler(source, camera, options.settings, options.device, options.seed, report.stage, bakes)
     if options.reuse_pictures is not None:
@@ -184,17 +185,6 @@ def find_output(options: Render) -> Output:
     if options.resume and not output.is_exr:
         raise OptionError("--resume needs .exr files, which say how they were made; a .png does not")
     return output
-
-
-def turn_sky(options: Render, scene: Scene | BakedScene, camera: Camera | CameraPath) -> None:
-    """Make the sky turn, if ``--environment-turn`` says so."""
-    turn, sky = options.environment_turn, scene.environment
-    if not math.isfinite(turn):
-        raise OptionError(f"--environment-turn must be a finite number of degrees, got {turn:g}")
-    if turn and sky is None:
-        raise OptionError(f"--environment-turn needs a sky to turn, and {scene.name} has none; give --environment too")
-    if turn:
-        scene.environment = TurningSky(sky, turn, camera.fps if isinstance(camera, CameraPath) else STILL_FPS)
 
 
 def render_shots(options: Render, plan: Plan, sequence: SequenceRun, report: Reporter) -> dict[str, list[float]]:

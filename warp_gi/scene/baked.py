@@ -28,6 +28,7 @@ class BakedScene:
     environment = None
     is_animated = False
     is_sky_animated = False
+    sky_at = None
     triangle_count = 0
     emitter_count = 0
     nodes: tuple[()] = ()

@@ -323,7 +323,12 @@ def _read_image(path: Path) -> np.ndarray:
 
     name = f"environment {str(path)!r}"
     if not path.is_file():
-        raise SceneError(f"{name}: no such file; give a latitude-longitude EXR or HDR image")
+        hint = (
+            "give gi.SkySequence(...) for a file a frame"
+            if "#" in path.name
+            else "give a latitude-longitude EXR or HDR image"
+        )
+        raise SceneError(f"{name}: no such file; {hint}")
     if path.stat().st_size == 0:
         raise SceneError(f"{name}: the file is empty")
     image = oiio.ImageInput.open(str(path))

@@ -6,7 +6,7 @@ import hashlib
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -19,7 +19,7 @@ from warp_gi.scene import animation, emitters, geometry, textures
 from warp_gi.scene.device_scene import DeviceScene
 from warp_gi.scene.edits import Edits
 from warp_gi.scene.model import Keyframe, Material, Mesh, Node, PunctualLight
-from warp_gi.scene.sky_motion import appearance, as_sky, sky_at_time
+from warp_gi.scene.sky_motion import appearance, first_sky, sky_at_time
 
 if TYPE_CHECKING:
     from warp_gi.bvh import TriangleBvh
@@ -109,23 +109,27 @@ class Scene:
         """The present sky. Set it to a path, an RGB radiance, an Environment, a SunSky or None; geometry stays built.
 
         Set to a function of the time in seconds that returns one of these, as a ``gi.TurningSky`` does, it is another
-        from frame to frame: that of time 0 at first, then that of the last ``update_sky``. For one time the function
-        has to return one sky always. Raises SceneError for what is no sky.
+        from frame to frame: that of time 0, or of its attribute ``start`` [s], at first, then that of the last
+        ``update_sky``. For one time the function has to return one sky always. Raises SceneError for what is no sky.
         """
         return self._environment
 
     @environment.setter
     def environment(self, value: Sky | Callable[[float], Sky]) -> None:
-        sky_at = value if callable(value) and not isinstance(value, type) else None
-        sky = sky_at_time(sky_at, 0.0) if sky_at is not None else as_sky(cast("Sky", value))
+        sky_at, start, sky = first_sky(value)
         with self.lock:
-            self._sky_at, self._sky_time = sky_at, 0.0
+            self._sky_at, self._sky_time = sky_at, start
             self._show(sky)
 
     @property
     def is_sky_animated(self) -> bool:
         """Whether the environment is a function of time."""
         return self._sky_at is not None
+
+    @property
+    def sky_at(self) -> Callable[[float], Sky] | None:
+        """The function of time in seconds that the environment is, or None."""
+        return self._sky_at
 
     def update_sky(self, time: float) -> bool:
         """Move the sky to ``time`` [s], if it is a function of time; return whether it is another one now.

@@ -18,7 +18,7 @@ from typing import Protocol
 import numpy as np
 
 from warp_gi.errors import OptionError, SceneError
-from warp_gi.files import replacing
+from warp_gi.files import frame_path, replacing
 from warp_gi.scene.camera import Camera
 from warp_gi.sequence.exr import Attribute, plain, read_exr, stored_values, write_exr
 from warp_gi.sequence.preview import tone_map, write_png
@@ -97,21 +97,6 @@ class FrameFile:
         if name not in self.buffers:
             raise OptionError(f"the file has no layer {name!r} (it has: {', '.join(self.buffers)})")
         return self.buffers[name]
-
-
-def frame_path(pattern: str | Path, index: int) -> Path:
-    """Return the file of frame ``index``: the last run of ``#`` in the name becomes the zero-padded number.
-
-    A name without ``#`` is returned as it is. Raises OptionError for a negative index.
-    """
-    if index < 0:
-        raise OptionError(f"frame numbers start at 0, got {index}")
-    pattern = Path(pattern)
-    runs = list(re.finditer("#+", pattern.name))
-    if not runs:
-        return pattern
-    start, end = runs[-1].span()
-    return pattern.with_name(f"{pattern.name[:start]}{index:0{end - start}d}{pattern.name[end:]}")
 
 
 def parse_frames(text: str) -> list[int]:

@@ -21,12 +21,11 @@ from typing import TYPE_CHECKING, Literal
 
 from warp_gi.baking import load_bake
 from warp_gi.errors import BakeError, OptionError, unknown_name
-from warp_gi.files import check_writable, remove_stale_parts
+from warp_gi.files import check_writable, frame_path, remove_stale_parts
 from warp_gi.scene.camera import Camera, CameraPath, frame_time
 from warp_gi.sequence.exr import Attribute
 from warp_gi.sequence.frames import (
     frame_attributes,
-    frame_path,
     read_frame,
     why_not_whole,
     write_frame,

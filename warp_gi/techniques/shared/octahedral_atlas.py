@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from warp_gi.errors import one_line
+from warp_gi.techniques.shared.exr_parts import Part, write_exr_parts
 from warp_gi.techniques.shared.octahedral import wrapped_texels
 
 PADDING = 1
@@ -63,28 +64,11 @@ def write_parts(
 
     Raises OSError.
     """
-    import OpenImageIO as oiio
-
     first = pixels(0)
-    height, width, count = first.shape
-    specs = []
-    for name in names:
-        spec = oiio.ImageSpec(width, height, count, "half" if first.dtype == np.float16 else "float")
-        spec.channelnames = tuple(channels)
-        spec.attribute("compression", "zip")
-        spec.attribute("DateTime", "")  # else the time of day goes into every file
-        if name:
-            spec.attribute("oiio:subimagename", name)
-        specs.append(spec)
-    output = oiio.ImageOutput.create("exr")
-    if output is None:
-        raise OSError(f"cannot write {path}: this OpenImageIO writes no EXR files; install one that does")
-    done = output.open(str(part), tuple(specs)) if len(specs) > 1 else output.open(str(part), specs[0])
-    for index, spec in enumerate(specs):
-        if index:
-            done = done and output.open(str(part), spec, "AppendSubimage")
-        done = done and output.write_image(np.ascontiguousarray(pixels(index) if index else first))
-    done = output.close() and done
-    if not done or output.has_error:
-        problem = one_line(output.geterror(), "unknown failure")
-        raise OSError(f"cannot write {path}: {problem.replace(str(part), str(path))}")
+    height, width, _ = first.shape
+    kind = "half" if first.dtype == np.float16 else "float"
+    parts = [
+        Part(name, channels, (width, height), partial(pixels, index) if index else lambda: first, kind)
+        for index, name in enumerate(names)
+    ]
+    write_exr_parts(part, path, parts)

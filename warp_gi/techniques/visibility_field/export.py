@@ -14,9 +14,8 @@ import numpy as np
 
 from warp_gi.baking import Bake
 from warp_gi.errors import BakeError, OptionError
-from warp_gi.files import replacing
+from warp_gi.files import frame_path, replacing
 from warp_gi.kernels import visibility_field as field_kernels
-from warp_gi.sequence.frames import frame_path
 from warp_gi.techniques.shared.octahedral import texels_of
 from warp_gi.techniques.shared.octahedral_atlas import (
     MAPPING,
