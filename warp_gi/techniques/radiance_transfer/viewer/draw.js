@@ -38,9 +38,9 @@ class Drawing {
     this.pages = [];
     for (const sides of about.pages) {
       this.pages.push([]);
-      for (const record of sides) this.pages.at(-1).push(record && this.page(record, await texelsOf(record)));
+      for (const record of sides) this.pages.at(-1).push(record && (await this.page(record)));
     }
-    for (const sky of about.skies) this.maps.push(this.map(sky.map, await texelsOf(sky.map)));
+    for (const sky of about.skies) this.maps.push(this.map(sky.map, await mapTexels(sky.map)));
     const error = gl.getError();
     if (error === gl.OUT_OF_MEMORY) throw new Error("this device has too little graphics memory for the bake");
     if (error) throw new Error(`WebGL error ${error}`);
@@ -77,12 +77,15 @@ class Drawing {
     return gl.getParameter(target === gl.TEXTURE_2D ? gl.TEXTURE_BINDING_2D : gl.TEXTURE_BINDING_2D_ARRAY);
   }
 
-  page(record, texels) {
+  async page(record) {
     const { gl } = this;
-    const [, height, width] = record.shape;
     const made = this.texture(gl.TEXTURE_2D_ARRAY, gl.CLAMP_TO_EDGE, gl.CLAMP_TO_EDGE, gl.LINEAR);
-    gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RGBA16F, width, height, this.about.layers);
-    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, 0, width, height, this.about.layers, gl.RGBA, gl.HALF_FLOAT, texels);
+    gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RGBA16F, ...record.size, record.layers.length);
+    for (const [k, layer] of record.layers.entries()) {
+      const texels = await layerTexels(layer, record.steps.slice(4 * k, 4 * k + 4));
+      gl.bindTexture(gl.TEXTURE_2D_ARRAY, made);
+      gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, k, ...record.size, 1, gl.RGBA, gl.FLOAT, texels);
+    }
     return made;
   }
 

@@ -7,6 +7,7 @@ of ``shade_transfer``: albedo / pi times (L . T + L . B + lamps), with all of th
 from __future__ import annotations
 
 import json
+import logging
 import math
 import warnings
 from collections.abc import Iterator
@@ -26,12 +27,13 @@ from warp_gi.scene.camera import Camera
 from warp_gi.scene.environment import Environment
 from warp_gi.scene.scene import Scene
 from warp_gi.techniques.radiance_transfer.settings import LIGHT_ORDER
-from warp_gi.techniques.radiance_transfer.textures import TransferTextures, transfer_textures
+from warp_gi.techniques.radiance_transfer.textures import Atlas, TransferTextures, transfer_textures
 from warp_gi.techniques.radiance_transfer.viewer import pages, skies, surfaces
 from warp_gi.techniques.radiance_transfer.viewer.pages import Rows
 from warp_gi.techniques.radiance_transfer.viewer.parts import Parts
 from warp_gi.techniques.radiance_transfer.viewer.surfaces import Surfaces
 
+_LOG = logging.getLogger("warp_gi")
 FOLDER = Path(__file__).parent
 SCRIPTS = ("unpack.js", "light.js", "shaders.js", "draw.js", "viewer.js")
 SUFFIX = ".html"
@@ -39,28 +41,26 @@ LARGEST_MB = 30.0
 """Size of a page in MB (1e6 bytes), unless told otherwise."""
 IMAGE_SHARE = 0.35
 """Share of a page that images of base colour may take before they are made smaller."""
-LARGEST_STEP = 8
-"""Texels along a side that become one in the smallest page."""
 
 
 @dataclass(frozen=True)
 class Detail:
     """How exactly transfer is kept in a page."""
 
-    step: int
+    block: int
     """Texels along a side that become one."""
-    dropped_bits: int
-    """Bits of halves that are rounded away."""
+    fineness: int
+    """Steps, to which numbers are rounded, in their RMS."""
 
     def __str__(self) -> str:
-        said = [f"1 texel for {self.step} x {self.step}"] if self.step > 1 else []
-        if self.dropped_bits:
-            said.append(f"numbers of {11 - self.dropped_bits} bits instead of 11")
+        said = [f"1 texel for {self.block} x {self.block}"] if self.block > 1 else []
+        if self.fineness < pages.FINE:
+            said.append(f"numbers rounded to 1/{self.fineness} of their RMS")
         return " and ".join(said)
 
 
-DETAILS = (Detail(1, 0), Detail(1, pages.DROPPED_BITS), Detail(2, 0), Detail(2, pages.DROPPED_BITS))
-DETAILS = (*DETAILS, Detail(4, pages.DROPPED_BITS), Detail(LARGEST_STEP, pages.DROPPED_BITS))
+DETAILS = tuple(Detail(block, fineness) for block in (1, 2, 4, 8) for fineness in (pages.FINE, pages.COARSE))
+"""Details of pages, the next where one is too large."""
 
 
 def write_view(
@@ -75,8 +75,8 @@ def write_view(
     """Write a page that shows a bake under skies that turn; the file appears whole or not at all.
 
     The page is for WebGL2 with half-float targets, which browsers have had since 2021. Surfaces are matt, of their base
-    colour; bounces are 16 numbers that stand for 75; direct light of lamps is not shown. What is made smaller to fit, or
-    left out, is told by a warning of one line each.
+    colour; bounces are 24 numbers that stand for 75; direct light of lamps is not shown. What is made smaller to fit is
+    told by a warning; the page says that, too, and what else it leaves out.
 
     Args:
         bake: Transfer textures of the scene, in texels of an atlas.
@@ -99,15 +99,18 @@ def write_view(
     _check(textures, scene)
     with scene.lock:
         shown = surfaces.surfaces_of(scene, textures.atlas)
-        if shown.left_out:
-            warnings.warn(
-                f"{path.name}: {shown.left_out:,} triangles are left out: they move, or nothing is kept for them",
-                stacklevel=2,
-            )
+        rows = pages.rows_of(textures)
         fixed = _fixed(scene, shown, skies.page_skies(scene.environment if sky is None else sky))
-        text = _fitted(textures, scene, shown, camera, fixed, largest_mb, exposure, path.name)
+        fixed.about.update(_view(camera, shown, scene), exposure=exposure)
+        fixed.about["notes"] += _notes(scene, shown, rows)
+        lost = _with_images(scene, fixed, largest_mb)
+        text, less = _fitted(textures.atlas, rows, shown, fixed, largest_mb)
     with replacing(path) as part:
         part.write_text(text, encoding="utf-8")
+    for note in fixed.about["notes"]:
+        _LOG.info("%s: %s", path.name, note)
+    for note in filter(None, (lost, less)):
+        warnings.warn(f"{path.name}: {note}", stacklevel=2)
     return path
 
 
@@ -143,10 +146,10 @@ def _check(textures: TransferTextures, scene: Scene) -> None:
 class _Fixed:
     """What a page holds whatever the detail of its textures."""
 
-    geometry: Parts
-    """Vertices, triangles and skies; ``about`` has the numbers of these parts."""
+    parts: Parts
+    """Vertices, triangles, skies and images."""
     about: dict[str, Any]
-    """What says how they are read."""
+    """What says how they are read, and all else that the scripts know of the scene."""
 
 
 def _fixed(scene: Scene, shown: Surfaces, sky_list: list[skies.PageSky]) -> _Fixed:
@@ -169,103 +172,98 @@ def _fixed(scene: Scene, shown: Surfaces, sky_list: list[skies.PageSky]) -> _Fix
             }
             for one in sky_list
         ],
-        "notes": ["Direct light of lamps is not shown."] if scene.emitter_count else [],
+        "notes": [],
     }
     return _Fixed(parts, about)
 
 
-def _fitted(
-    textures: TransferTextures,
-    scene: Scene,
-    shown: Surfaces,
-    camera: Camera,
-    fixed: _Fixed,
-    largest_mb: float,
-    exposure: float,
-    name: str,
-) -> str:
-    """Return the page with the most detail that fits; warn of what is less."""
-    limit = int(largest_mb * 1e6)
-    images, image_step = _image_parts(scene, fixed.geometry, limit)
-    rows = pages.rows_of(textures)
-    if image_step > 1:
-        warnings.warn(f"{name}: images of base colour have 1/{image_step} of their size a side", stacklevel=3)
-    if rows.error > 0:
-        said = f"{name}: {len(rows.components)} numbers stand for the 75 of bounces, error {rows.error:.2g} of their RMS"
-        warnings.warn(said, stacklevel=3)
-    size = 0
+def _notes(scene: Scene, shown: Surfaces, rows: Rows) -> list[str]:
+    """Return what the page does not show, or not exactly."""
+    notes = []
+    if shown.left_out:
+        notes.append(f"{shown.left_out:,} triangles are left out: they move, or nothing is kept for them.")
+    if len(rows.components):
+        notes.append(
+            f"{len(rows.components)} numbers stand for the 75 of bounces, error {rows.error:.2g} of their mean."
+        )
+    if scene.emitter_count:
+        notes.append("Direct light of lamps is not shown.")
+    return notes
+
+
+def _with_images(scene: Scene, fixed: _Fixed, largest_mb: float) -> str:
+    """Add materials, and images of base colour and emission; return how much smaller they are, or ""."""
+    images = surfaces.images_of(scene.materials)
+    cut = {id(one.base_color_texture) for one in scene.materials if one.alpha_cutoff is not None}
+    for step in (1, 2, 4, 8, 16):
+        files = [surfaces.image_file(one, id(one) in cut, step) for one in images]
+        if sum(map(len, files)) * 4 / 3 <= IMAGE_SHARE * largest_mb * 1e6:
+            break
+    fixed.about["images"] = [
+        {**fixed.parts.add_file(file), "wrap": list(one.wrap), "srgb": one.srgb}
+        for file, one in zip(files, images, strict=True)
+    ]
+    fixed.about["materials"] = [surfaces.material_record(one, images) for one in scene.materials]
+    said = f"Images have 1/{step} of their pixels a side, to stay under {largest_mb:g} MB." if step > 1 else ""
+    fixed.about["notes"] += [said] if said else []
+    return said
+
+
+def _fitted(atlas: Atlas, rows: Rows, shown: Surfaces, fixed: _Fixed, largest_mb: float) -> tuple[str, str]:
+    """Return the page with the most detail that fits, and what is less in it, or ""; raises OptionError."""
+    size, limit = 0, int(largest_mb * 1e6)
     for detail in DETAILS:
-        parts = Parts([*fixed.geometry.texts, *images[0].texts])
+        parts = Parts([*fixed.parts.texts])
+        said = f"It has {detail}, to stay under {largest_mb:g} MB." if str(detail) else ""
         about = {
             **fixed.about,
-            **images[1],
-            **_view(camera, shown, scene),
-            **_light(rows),
-            "exposure": exposure,
-            "places": parts.add(_places(textures, shown, detail.step)),
-            "pages": _page_parts(textures, rows, shown, detail, parts, limit),
+            "layers": rows.layers,
+            "components": np.round(rows.components, 7).tolist(),
+            "hasBounces": bool(len(rows.components)) or rows.has_lamps,
+            "places": parts.add(_places(atlas, shown, detail.block)),
+            "pages": _page_parts(atlas, rows, shown, detail, parts, limit),
+            "notes": [*fixed.about["notes"], *filter(None, [said])],
         }
         text = _page(about, parts) if parts.nbytes <= limit else ""
         size = len(text.encode()) or parts.nbytes
         if size <= limit:
-            if str(detail):
-                warnings.warn(f"{name}: to stay under {largest_mb:g} MB it has {detail}", stacklevel=3)
-            return text
+            return text, said
     raise OptionError(
-        f"{name}: expected at most {largest_mb:g} MB, got {size / 1e6:.3g} MB with the fewest texels"
-        f" ({len(shown.triangles):,} triangles); allow a larger page, or bake fewer texels or triangles"
+        f"expected a page of at most {largest_mb:g} MB, got {size / 1e6:.3g} MB with the fewest texels"
+        f" ({len(shown.triangles):,} triangles); allow a larger one, or bake fewer texels or triangles"
     )
 
 
-def _image_parts(scene: Scene, before: Parts, limit: int) -> tuple[tuple[Parts, dict[str, Any]], int]:
-    """Return parts of images of base colour and emission, what says how they are read, and how much smaller they are."""
-    images = surfaces.images_of(scene.materials)
-    cut = {id(m.base_color_texture) for m in scene.materials if m.alpha_cutoff is not None}
-    for step in (1, 2, 4, 8, 16):
-        parts = Parts([""] * len(before.texts))
-        records = [
-            {**parts.add_file(surfaces.image_file(one, id(one) in cut, step)), "wrap": list(one.wrap), "srgb": one.srgb}
-            for one in images
-        ]
-        if parts.nbytes <= IMAGE_SHARE * limit:
-            break
-    materials = [surfaces.material_record(one, images) for one in scene.materials]
-    parts.texts = parts.texts[len(before.texts) :]
-    return (parts, {"images": records, "materials": materials}), step
-
-
 def _page_parts(
-    textures: TransferTextures, rows: Rows, shown: Surfaces, detail: Detail, parts: Parts, limit: int
+    atlas: Atlas, rows: Rows, shown: Surfaces, detail: Detail, parts: Parts, limit: int
 ) -> list[list[dict[str, Any] | None]]:
-    """Add the textures of each page and side that is drawn; stops where they are too large anyhow."""
+    """Add the textures of each page and side that is drawn; stops where the page is too large anyhow."""
     drawn = {(group["page"], group["side"]) for group in shown.groups}
+    steps = pages.steps_of(rows, detail.fineness)
     result: list[list[dict[str, Any] | None]] = []
-    for page in range(len(textures.atlas.pages)):
-        sides: list[dict[str, Any] | None] = []
+    for page in range(len(atlas.pages)):
+        result.append([None, None])
         for side in range(2):
-            if (page, side) not in drawn or parts.nbytes > limit:
-                sides.append(None)
-                continue
-            texels = pages.page_texels(textures.atlas, rows.values, page, side, detail.step, detail.dropped_bits)
-            sides.append(parts.add(texels))
-        result.append(sides)
+            if (page, side) in drawn and parts.nbytes <= limit:
+                layers: list[dict[str, Any]] = []
+                for texels in pages.page_layers(atlas, rows, page, side, detail.block, steps):
+                    layers.append(parts.add_differences(texels))
+                    if parts.nbytes > limit:
+                        break
+                size = pages.page_size(atlas, page, detail.block)
+                result[-1][side] = {"size": size, "layers": layers, "steps": steps.tolist()}
     return result
 
 
-def _places(textures: TransferTextures, shown: Surfaces, step: int) -> np.ndarray:
+def _places(atlas: Atlas, shown: Surfaces, block: int) -> np.ndarray:
     """Return places of vertices in 0..1 of their page's texture, float32 [n, 2]."""
-    sizes = np.array([pages.page_size(textures.atlas, page, step) for page in range(len(textures.atlas.pages))])
     result = shown.places.astype(np.float64)
     for group in shown.groups:
         first = group["first"]
         vertices = np.unique(shown.triangles[first : first + group["count"]])
-        result[vertices] = shown.places[vertices] / (sizes[group["page"]] * step)
+        size = np.array(pages.page_size(atlas, group["page"], block)) * block
+        result[vertices] = shown.places[vertices] / size
     return result.astype(np.float32)
-
-
-def _light(rows: Rows) -> dict[str, Any]:
-    shown = bool(len(rows.components)) or rows.has_lamps
-    return {"layers": rows.layers, "hasBounces": shown, "components": np.round(rows.components, 7).tolist()}
 
 
 def _view(camera: Camera, shown: Surfaces, scene: Scene) -> dict[str, Any]:

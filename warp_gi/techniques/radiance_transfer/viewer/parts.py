@@ -34,8 +34,14 @@ class Parts:
         array = np.ascontiguousarray(array)
         size = array.dtype.itemsize
         planes = array.astype(array.dtype.newbyteorder("<")).view(np.uint8).reshape(-1, size).T
-        self.texts.append(base64.b64encode(zlib.compress(np.ascontiguousarray(planes), LEVEL)).decode("ascii"))
+        self.texts.append(base64.b64encode(zlib.compress(planes.tobytes(), LEVEL)).decode("ascii"))
         return {"part": len(self.texts) - 1, "size": size, "shape": list(array.shape)}
+
+    def add_differences(self, numbers: np.ndarray) -> dict[str, Any]:
+        """Add int16 [..., width] as differences from the number on the left."""
+        differences = numbers.copy()
+        differences[..., 1:] -= numbers[..., :-1]  # modulo 2^16
+        return self.add(differences)
 
     def add_file(self, data: bytes) -> dict[str, Any]:
         """Add a file as it is, and return the number of the part."""

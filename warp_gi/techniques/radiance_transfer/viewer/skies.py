@@ -32,7 +32,7 @@ class PageSky:
 
 
 def page_skies(sky: Environment | None) -> list[PageSky]:
-    """Return ``sky``, unless there is none or it is black, and some that are as bright in the mean; or of radiance 1."""
+    """Return ``sky``, unless there is none or it is black, and some of the same mean luminance, or of 1."""
     result, mean = [], 1.0
     if sky is not None and not sky.is_black:
         result.append(page_sky("the scene's own", sky))

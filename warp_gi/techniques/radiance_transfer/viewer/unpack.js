@@ -27,16 +27,28 @@ async function numbersOf(record, Type) {
   return new Type(bytes.buffer);
 }
 
-// Halves [channels, height, width] as texels: [layers, height, width, 4], channels that are missing are 0.
-async function texelsOf(record) {
+// Halves [3, height, width] as texels [height, width, 4].
+async function mapTexels(record) {
+  const halves = await numbersOf(record, Uint16Array);
+  const area = record.shape[1] * record.shape[2];
+  const texels = new Uint16Array(4 * area);
+  for (let c = 0; c < 3; c++) for (let i = 0; i < area; i++) texels[4 * i + c] = halves[c * area + i];
+  return texels;
+}
+
+// A layer of a page, differences [4, height, width] in steps, as texels: Float32Array [height, width, 4].
+async function layerTexels(record, steps) {
   const [planes, count] = await planesOf(record);
-  const [channels, height, width] = record.shape;
-  const area = height * width;
-  const texels = new Uint16Array(Math.ceil(channels / 4) * 4 * area);
-  for (let c = 0; c < channels; c++) {
-    let from = c * area;
-    let to = (c >> 2) * 4 * area + (c & 3);
-    for (let i = 0; i < area; i++, from++, to += 4) texels[to] = planes[from] | (planes[from + count] << 8);
+  const [, height, width] = record.shape;
+  const texels = new Float32Array(count);
+  for (let c = 0, from = 0; c < 4; c++) {
+    for (let y = 0, to = c; y < height; y++) {
+      let value = 0;
+      for (let x = 0; x < width; x++, from++, to += 4) {
+        value = ((value + (planes[from] | (planes[from + count] << 8))) << 16) >> 16;
+        texels[to] = value * steps[c];
+      }
+    }
   }
   return texels;
 }

@@ -126,6 +126,7 @@ class Viewer {
 
   fillPanel() {
     const choice = document.getElementById("sky");
+    document.getElementById("panel").open = window.innerWidth >= 600;
     this.about.skies.forEach((sky, k) => choice.add(new Option(sky.name, k)));
     document.getElementById("notes").textContent = this.about.notes.join(" ");
     document.getElementById("bounces-label").hidden = !this.about.hasBounces;
