@@ -69,6 +69,8 @@ class BakeOptions(SceneOptions):
     """Folder for pictures of the bake; they are described above."""
     export: Annotated[Path | None, flag("FILE", "none")] = None
     """File for the bake as textures for other programs, beside a .json that says how to read them; see above."""
+    export_components: Annotated[int, flag("N", "all")] = 0
+    """Number of principal components to export in place of all numbers, where a technique can; see above."""
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print nothing but errors."""
     settings: Annotated[Estimator, tyro.conf.arg(name="")] = field(
@@ -147,7 +149,10 @@ def run(options: BakeOptions, report: Reporter) -> None:
     if output.suffix.lower() != BAKE_SUFFIX:
         raise OptionError(f"cannot write {output.name}: bakes are .safetensors files")
     if options.export is not None:
-        tool.check_export_name(options.export)
+        tool.check_export(options.settings, options.export, options.export_components)
+    if options.export_components and (options.export is None or not tool.compresses):
+        names = " or ".join(name for name in BAKEABLE if tool_of(name).compresses)
+        raise OptionError(f"--export-components goes with --export of {names}; leave it out")
     resolution = parse_resolution(options.picture) if options.picture else None
     with report.phase("scene"):
         scene = find_scene(options)
@@ -181,7 +186,7 @@ def run(options: BakeOptions, report: Reporter) -> None:
         report.line(f"{compiled:.1f} s of that compiling kernels")
     if options.export is not None:
         with report.phase("export"):
-            files = tool.export(result, options.export)
+            files = tool.export(result, options.export, scene, options.export_components)
         more = f" to {files[-2].name}" * (len(files) > 2)
         report.line(f"{tool.exported}: {files[0]}{more}, described by {files[-1]}")
     if options.show is not None and camera is not None:

@@ -48,6 +48,8 @@ class BakeTool(ABC, Generic[Settings]):
     """Arguments of the command's examples, as "hall.glb --cell-size 0.5"; without ``--technique``."""
     exported: ClassVar[str]
     """Word for the files of an export, as "textures"."""
+    compresses: ClassVar[bool] = False
+    """Whether an export can hold principal components of something, so that ``components`` may be above 0."""
     needs_sky: ClassVar[bool] = False
     """Whether its pictures show nothing without a sky, so that a white sky stands in for one."""
     finds_places: ClassVar[bool] = False
@@ -62,12 +64,15 @@ class BakeTool(ABC, Generic[Settings]):
         """Raise OptionError for a bake of the scene that would be too large."""
 
     @abstractmethod
-    def check_export_name(self, path: Path) -> None:
-        """Raise OptionError for a file that an export cannot be."""
+    def check_export(self, settings: Settings, path: Path, components: int) -> None:
+        """Raise OptionError for a file that an export cannot be, and for settings whose bake cannot be exported."""
 
     @abstractmethod
-    def export(self, bake: Bake, path: Path) -> list[Path]:
-        """Write the files of an export and return them, the description last."""
+    def export(self, bake: Bake, path: Path, scene: Scene, components: int) -> list[Path]:
+        """Write the files of an export of the scene's bake and return them, the description last.
+
+        ``components`` is the number of principal components to compress to; 0 compresses nothing.
+        """
 
     @abstractmethod
     def write_pictures(

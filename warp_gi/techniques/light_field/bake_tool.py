@@ -49,11 +49,11 @@ class LightFieldTool(BakeTool[LightFieldProbes]):
         if all(settings.counts):
             probe_grid(scene.bounds, settings.counts, settings.spacing, settings.probe_settings.largest_map)
 
-    def check_export_name(self, path: Path) -> None:
+    def check_export(self, settings: LightFieldProbes, path: Path, components: int) -> None:
         """Raise OptionError unless the file is an .exr."""
         export_files.check_export_name(path)
 
-    def export(self, bake: Bake, path: Path) -> list[Path]:
+    def export(self, bake: Bake, path: Path, scene: Scene, components: int) -> list[Path]:
         """Write the maps as atlases."""
         return export_files.export_atlases(bake, path)
 

@@ -22,5 +22,6 @@ TECHNIQUE = Technique(
             "indirect": ("RadianceTransfer", {"term": "indirect"}),
         },
     },
+    bake_tool="bake_tool",
     samplers=("transfer_light.TRANSFER_CACHE",),
 )

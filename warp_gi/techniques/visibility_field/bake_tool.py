@@ -41,11 +41,11 @@ class VisibilityFieldTool(BakeTool[VisibilityField]):
         """Raise OptionError for a grid that is too fine."""
         settings.bake_settings(scene)
 
-    def check_export_name(self, path: Path) -> None:
+    def check_export(self, settings: VisibilityField, path: Path, components: int) -> None:
         """Raise OptionError unless the file is a .png or .exr."""
         export_files.check_export_name(path)
 
-    def export(self, bake: Bake, path: Path) -> list[Path]:
+    def export(self, bake: Bake, path: Path, scene: Scene, components: int) -> list[Path]:
         """Write the masks as textures."""
         return export_files.export_textures(bake, path)
 

@@ -1,0 +1,120 @@
+"""``warp-gi bake`` of radiance transfer textures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from warp_gi.baking import Bake
+from warp_gi.errors import OptionError, check_whole
+from warp_gi.scene.camera import Camera
+from warp_gi.scene.scene import Scene
+from warp_gi.techniques.bake_tool import BakeTool, Rows, Table, times
+from warp_gi.techniques.radiance_transfer import export as export_files
+from warp_gi.techniques.radiance_transfer import pictures
+from warp_gi.techniques.radiance_transfer.estimator import RadianceTransfer
+from warp_gi.techniques.radiance_transfer.pca import CHANNELS
+from warp_gi.techniques.radiance_transfer.textures import transfer_textures
+
+
+class RadianceTransferTool(BakeTool[RadianceTransfer]):
+    """Bakes the textures of all surfaces that rest."""
+
+    settings = RadianceTransfer
+    summary = (
+        "How the light of any sky arrives at each texel of the surfaces, directly and over other surfaces. There",
+        "is no sky in it: one bake serves every sky, only the pictures depend on it.",
+    )
+    shows = ("charts, what the sky lights directly and over other surfaces, and a view",)
+    exports = (
+        "for NAME.exr the coefficients, NAME.rgba.exr the same by fours, and NAME.glb,",
+        "the surfaces with the coordinates of the atlas; --export-components is of its bounces",
+    )
+    examples = (
+        "hall.glb --resolution 2048 --order 6",
+        "atrium --export out/a.exr --export-components 16 --show out/atrium_transfer",
+    )
+    exported = "textures"
+    compresses = True
+    needs_sky = True
+    finds_places = True
+
+    def check(self, settings: RadianceTransfer, everywhere: bool) -> None:
+        """Raise OptionError for ``everywhere``."""
+        if everywhere:
+            raise OptionError(
+                "--everywhere goes with visibility fields; a bake of transfer is always of all surfaces: omit it"
+            )
+
+    def check_scene(self, settings: RadianceTransfer, scene: Scene) -> None:
+        """Do nothing: what does not fit is known once there are charts."""
+
+    def check_export(self, settings: RadianceTransfer, path: Path, components: int) -> None:
+        """Raise OptionError unless the file is an .exr of texels, and for components of bounces that are not there."""
+        export_files.check_export_name(path)
+        if settings.storage == "vertices":
+            raise OptionError("transfer at vertices has no images; bake with --storage texture to export it")
+        if components:
+            check_whole("--export-components", components, 1, CHANNELS)
+            if not settings.bounces:
+                raise OptionError("--export-components are of bounces, and --bounces is 0; leave one of them out")
+
+    def export(self, bake: Bake, path: Path, scene: Scene, components: int) -> list[Path]:
+        """Write images, surfaces and their description."""
+        return export_files.export_textures(bake, path, scene, components)
+
+    def write_pictures(
+        self, scene: Scene, camera: Camera, bake: Bake, settings: RadianceTransfer, folder: Path, device: str, seed: int
+    ) -> list[Path]:
+        """Write charts, what arrives directly and over other surfaces, and a view."""
+        return pictures.write_pictures(scene, camera, bake, settings, folder, device, seed)
+
+    def rows(self, bake: Bake, seconds: float) -> Rows:
+        """Return counts of charts, pages, texels, slots and rays, what bounced, and bytes."""
+        textures, counts = transfer_textures(bake), bake.counts
+        atlas, slots = textures.atlas, max(textures.atlas.count, 1)
+        values = (textures.transfer, textures.bounces, textures.lamps)
+        rows: Rows = []
+        if len(atlas.pages):
+            rows = [
+                ("charts", int(atlas.charts.max(initial=-1)) + 1),
+                ("pages", len(atlas.pages)),
+                ("largest page", times(atlas.pages[np.argmax(atlas.pages[:, 1] * atlas.pages[:, 2]), 1:])),
+                ("texels", int((atlas.pages[:, 1] * atlas.pages[:, 2]).sum())),
+            ]
+        rows += [
+            ("slots", atlas.count),
+            ("slots of backs", int(np.count_nonzero(atlas.slot_sides))),
+            ("rays", int(counts["rays"])),
+            ("rays a slot", counts["rays"] / slots),
+            ("seconds", round(seconds, 3)),
+            ("million rays a second", counts["rays"] / 1e6 / max(seconds, 1e-9)),
+        ]
+        if "bounces" in counts:
+            rows += [("bounces", int(counts["bounces"])), ("share of the last", float(counts["last_share"]))]
+            rows.append(("share of its rays that find nothing kept", float(counts["black_share"])))
+        return [
+            *rows,
+            ("bytes a slot", sum(array.nbytes for array in values) // slots),
+            ("in memory [MB]", bake.nbytes / 1e6),
+        ]
+
+    def tables(self, bake: Bake) -> list[Table]:
+        """Return the seconds of the stages."""
+        stages = [name.removesuffix("_cpu_seconds") for name in bake.counts if name.endswith("_cpu_seconds")]
+        rows = [(name, bake.counts[f"{name}_seconds"], bake.counts[f"{name}_cpu_seconds"]) for name in stages]
+        return [Table("seconds by stage", ("stage", "seconds", "CPU seconds, without xatlas"), rows)] if rows else []
+
+    def advice(self, bake: Bake, settings: RadianceTransfer) -> str:
+        """Return advice to allow more bounces, if the last one still added too much light."""
+        last = bake.counts.get("last_share", 0.0)
+        if not settings.tolerance or last <= settings.tolerance:
+            return ""
+        return (
+            f"the last bounce still added {last:.2g} of the light, more than the tolerance of "
+            f"{settings.tolerance:g}: give more --bounces than {settings.bounces}"
+        )
+
+
+TOOL = RadianceTransferTool()
