@@ -10,6 +10,7 @@ import warp as wp
 from warp_gi.kernels.bsdf import Bsdf, average_reflectance, bsdf_evaluate, diffuse_share
 from warp_gi.kernels.bvh import BvhHit, bvh_occluded
 from warp_gi.kernels.path_samplers import KnownRadiance, PathCache
+from warp_gi.kernels.sampling import circle, frame_of
 from warp_gi.kernels.surface import Surface, ray_origin, shading_normal
 from warp_gi.kernels.transfer_atlas import SlotFetch, TransferAtlas, atlas_fetch, side_seen
 from warp_gi.kernels.transfer_lobes import LobeTable, lobe_at
@@ -40,6 +41,7 @@ class TransferSky:
     sun_count: wp.int32
     sun_directions: wp.array(dtype=wp.vec3)
     sun_irradiances: wp.array(dtype=wp.vec3)  # W/m^2 perpendicular to the direction
+    sun_discs: wp.array(dtype=wp.float32)  # cosines of their half-angles as even discs; 1: a point
 
 
 # Where transfer of the point of a hit is kept, seen from the side of `s.normal`.
@@ -62,12 +64,15 @@ def bounced_irradiance(rows: TransferRows, sky: TransferSky, at: SlotFetch) -> w
     return light
 
 
-# Radiance of the suns that a BSDF at a surface reflects towards wo, which is in the frame of its shading.
+# Radiance of the suns that a BSDF at a surface reflects towards wo, which is in the frame of its shading. A point of
+# the unit square is the place on a sun's disc; (0, 0) is its middle.
 @wp.func
-def sun_radiance(scene: SceneData, sky: TransferSky, s: Surface, b: Bsdf, wo: wp.vec3) -> wp.vec3:
+def sun_radiance(scene: SceneData, sky: TransferSky, s: Surface, b: Bsdf, wo: wp.vec3, u: wp.vec2) -> wp.vec3:
     sum = wp.vec3(0.0, 0.0, 0.0)
     for k in range(sky.sun_count):
-        direction = sky.sun_directions[k]
+        away = u[0] * (1.0 - sky.sun_discs[k])  # one minus the cosine of the angle to the middle
+        around = circle(u[1]) * wp.sqrt(away * (2.0 - away))
+        direction = frame_of(sky.sun_directions[k]) * wp.vec3(around[0], around[1], 1.0 - away)
         if wp.dot(direction, s.normal) > 0.0:
             f = bsdf_evaluate(b, wo, wp.transpose(s.shading) * direction)
             if wp.max(f.value) > 0.0 and not bvh_occluded(scene.bvh, ray_origin(s), direction, float(wp.inf)):

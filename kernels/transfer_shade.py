@@ -4,6 +4,7 @@ import warp as wp
 
 from warp_gi.kernels.bsdf import average_reflectance
 from warp_gi.kernels.gbuffer import PassSettings, PrimaryHits, tiled_pixel
+from warp_gi.kernels.sampling import OWN_DIMENSION, pixel_sample_index, pixel_seed, sample_2d
 from warp_gi.kernels.surface import Surface, surface_at
 from warp_gi.kernels.transfer_atlas import SlotFetch
 from warp_gi.kernels.transfer_light import (
@@ -22,6 +23,7 @@ wp.set_module_options({"enable_backward": False})
 
 WANTS_ENVIRONMENT = wp.constant(1)
 WANTS_INDIRECT = wp.constant(2)
+SUN_DIMENSION = wp.constant(OWN_DIMENSION + 1)  # by camera sample
 
 
 # What a launch is asked for.
@@ -29,6 +31,7 @@ WANTS_INDIRECT = wp.constant(2)
 class TransferQuery:
     terms: wp.int32  # WANTS_*
     traced_below: wp.float32  # roughness below which rays are traced for the glossy lobe
+    soft: wp.int32  # 1: suns are discs, by one point of each a camera sample; 0: their middles
     traces: wp.int32  # 1: a launch of transfer_trace.py serves these pixels, and those where no transfer is kept
 
 
@@ -49,6 +52,16 @@ class TransferBuffers:
 @wp.func
 def is_traced(query: TransferQuery, s: Surface, at: SlotFetch) -> wp.bool:
     return not is_kept(at) or (s.bsdf.f90 > 0.0 and wp.sqrt(s.bsdf.alpha) < query.traced_below)
+
+
+# Place on the discs of suns in a camera sample of a pixel.
+@wp.func
+def sun_point(settings: PassSettings, p: wp.vec2i, soft: wp.int32) -> wp.vec2:
+    if soft == 0:
+        return wp.vec2(0.0, 0.0)
+    index = pixel_sample_index(p[0], p[1], settings.camera_sample, settings.camera_bits)
+    seed = pixel_seed(p[0], p[1], settings.camera_bits, settings.seed)
+    return sample_2d(index, seed, SUN_DIMENSION)
 
 
 # Adds radiance that stands for `count` equal samples.
@@ -98,7 +111,8 @@ def shade_transfer(
             light = light + glossy_radiance(rows, sky, s, at, -direction)
         light = wp.max(light, wp.vec3(0.0, 0.0, 0.0))
         if sky.sun_count > 0:
-            light = light + sun_radiance(scene, sky, s, s.bsdf, wp.transpose(s.shading) * -direction)
+            u = sun_point(settings, p, query.soft)
+            light = light + sun_radiance(scene, sky, s, s.bsdf, wp.transpose(s.shading) * -direction, u)
         b = buffers
         add_equal(b.environment, b.environment_moment1, b.environment_moment2, pixel, light, count)
     if (query.terms & WANTS_INDIRECT) != 0:

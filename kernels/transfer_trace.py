@@ -39,6 +39,7 @@ from warp_gi.kernels.transfer_shade import (
     TransferQuery,
     add_equal,
     is_traced,
+    sun_point,
 )
 from warp_gi.kernels.types import SceneData
 
@@ -48,6 +49,9 @@ TRACER = path_tracer(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY, TRANS
 TransferSamplers = TRACER.samplers
 trace_path = TRACER.trace_path
 NARROW = wp.constant(wp.float32(0.03))  # alpha below which a lobe's rays look for suns themselves: it is about as wide
+
+UP = wp.constant(wp.vec3(0.0, 0.0, 1.0))
+NO_POINT = wp.constant(wp.vec2(0.0, 0.0))
 
 
 # Light of one sample.
@@ -81,7 +85,7 @@ def leaving_radiance(
     irradiance = irradiance + bounced_irradiance(rows, sky, at)
     light = wp.cw_mul(average_reflectance(s.bsdf), irradiance) / wp.pi
     if sky.sun_count > 0:
-        light = light + sun_radiance(scene, sky, s, lambert(average_reflectance(s.bsdf)), wp.vec3(0.0, 0.0, 1.0))
+        light = light + sun_radiance(scene, sky, s, lambert(average_reflectance(s.bsdf)), UP, NO_POINT)
     if scene.emitters.count > 0:
         wanted.terms = TERM_EMITTERS
         r = trace_path(scene, samplers, hit, s, -direction, wanted, index, seed, NO_PATH)
@@ -119,7 +123,9 @@ def lobe_light(
 
 # Light of a sharp surface that needs no ray of its lobe: of its diffuse lobe, and of suns.
 @wp.func
-def known_light(scene: SceneData, cache: TransferCache, s: Surface, at: SlotFetch, wo: wp.vec3) -> TracedLight:
+def known_light(
+    scene: SceneData, cache: TransferCache, s: Surface, at: SlotFetch, wo: wp.vec3, u: wp.vec2
+) -> TracedLight:
     r = TracedLight()
     r.environment = wp.max(diffuse_radiance(cache.rows, cache.sky, s, at), wp.vec3(0.0, 0.0, 0.0))
     diffuse = wp.cw_mul(diffuse_share(s.bsdf), s.bsdf.diffuse)
@@ -127,7 +133,7 @@ def known_light(scene: SceneData, cache: TransferCache, s: Surface, at: SlotFetc
         b = s.bsdf
         if b.alpha < NARROW:
             b = lambert(diffuse)
-        r.environment = r.environment + sun_radiance(scene, cache.sky, s, b, wo)
+        r.environment = r.environment + sun_radiance(scene, cache.sky, s, b, wo, u)
     r.indirect = wp.cw_mul(diffuse, bounced_irradiance(cache.rows, cache.sky, at)) / wp.pi
     return r
 
@@ -160,7 +166,7 @@ def trace_transfer(
     if not is_traced(query, s, at):
         return
     wo = wp.transpose(s.shading) * view
-    known = known_light(scene, samplers.cache, s, at, wo)
+    known = known_light(scene, samplers.cache, s, at, wo, sun_point(settings, p, query.soft))
     seed = pixel_seed(p[0], p[1], settings.sample_bits, settings.seed)
     for i in range(settings.sample_count):
         index = pixel_sample_index(p[0], p[1], settings.first_sample + i, settings.sample_bits)

@@ -76,6 +76,9 @@ class RadianceTransfer(Estimator, RadianceCache):
     sun: float = 20.0
     """Radiance, in means of the sky, above which light is a sun's: it leaves the harmonics of direct light and gets a
     shadow ray. 0 keeps all light in the harmonics."""
+    soft_suns: bool = True
+    """Whether suns are discs, with soft shadows by a ray from each camera sample to another point; else points, with
+    hard shadows."""
     glossy: Literal["auto", "transfer", "traced"] = "auto"
     """How glossy lobes are lit: "auto" by transfer down to a roughness of ``traced_below`` and by rays below it,
     "transfer" by transfer alone, as in the paper, "traced" by rays alone."""
@@ -180,6 +183,7 @@ class RadianceTransfer(Estimator, RadianceCache):
             for order, moment in enumerate(frame.moments(one.term), 1):
                 setattr(buffers, f"{one.term}_moment{order}", moment)
         query.traced_below = {"transfer": 0.0, "traced": 2.0}.get(self.glossy, self.traced_below)
+        query.soft = int(self.soft_suns)
         query.traces = int(_needs_rays(frame.scene, query.traced_below))
         sky = self._sky(frame)
         inputs = [frame.data, frame.pass_settings, state.rows, sky, query, frame.hits, buffers]

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import warp as wp
 
+from warp_gi.kernels import transfer_lobes
 from warp_gi.kernels.transfer_light import TransferSky
 from warp_gi.kernels.transfer_products import LIGHT_WIDTH, WIDTHS
-from warp_gi.launch import on_device
+from warp_gi.launch import get_device, on_device
+from warp_gi.scene import harmonics
+from warp_gi.scene.environment import Environment
 from warp_gi.stateful import Ahead, Service
 from warp_gi.techniques.radiance_transfer import products
+from warp_gi.techniques.radiance_transfer.lobes import SMALLEST_ROUGHNESS, lobe_table
 from warp_gi.techniques.radiance_transfer.settings import LIGHT_ORDER, TransferSettings
 
 if TYPE_CHECKING:
     from warp_gi.baking import Bake
     from warp_gi.frame import Frame
     from warp_gi.scene.baked import BakedScene
-    from warp_gi.scene.environment import Environment
     from warp_gi.scene.scene import Scene
 
 
@@ -72,17 +76,37 @@ class TransferLight(Service):
 
     def _on_device(self, environment: Environment | None, device: wp.Device) -> TransferSky:
         order = self.bake_settings_of.order
-        whole = np.zeros((3, LIGHT_ORDER**2)) if environment is None else environment.harmonics_of(LIGHT_ORDER)
-        light = whole
+        environment = environment or Environment()
+        split = environment.split_sun(self.sun) if self.sun else None
+        rest = split.rest if split else environment
+        light = rest.harmonics_of(LIGHT_ORDER)
+        matrix = products.light_matrix(
+            light * harmonics.by_coefficient(products.window(LIGHT_ORDER, self.window)), order
+        )
         count, width = order * order, WIDTHS[order]
-        windowed = light * np.repeat(products.window(LIGHT_ORDER, self.window), 2 * np.arange(LIGHT_ORDER) + 1)
-        matrix = np.zeros((count, 3, width), np.float32)
-        matrix[:, :, :count] = products.light_matrix(windowed, order).transpose(1, 0, 2)
+        rows = np.zeros((count, 3, width), np.float32)
+        rows[:, :, :count] = matrix.transpose(1, 0, 2)
         result = TransferSky()
         result.light = on_device(_padded(light, width), wp.float32, device)
-        result.whole_light = on_device(_padded(whole, LIGHT_WIDTH), wp.float32, device)
-        result.matrix = on_device(matrix.reshape(-1), wp.float32, device)
+        result.whole_light = on_device(_padded(environment.harmonics_of(LIGHT_ORDER), LIGHT_WIDTH), wp.float32, device)
+        result.matrix = on_device(rows.reshape(-1), wp.float32, device)
+        result.lobes = lobes_on_device(order, device.alias)
+        result.rest = rest.data(device)
+        if split:
+            result.sun_count = len(split.directions)
+            result.sun_directions = on_device(split.directions.astype(np.float32), wp.vec3, device)
+            result.sun_irradiances = on_device(split.irradiances.astype(np.float32), wp.vec3, device)
+            result.sun_discs = on_device(split.cos_discs.astype(np.float32), wp.float32, device)
         return result
+
+
+@cache
+def lobes_on_device(order: int, device: str) -> transfer_lobes.LobeTable:
+    """Return the table of lobes for transfer of an order as kernels read it; made once a device."""
+    table = transfer_lobes.LobeTable()
+    table.entries = on_device(lobe_table(order).entries, wp.float32, get_device(device))
+    table.smallest = SMALLEST_ROUGHNESS
+    return table
 
 
 def _padded(light: np.ndarray, width: int) -> np.ndarray:
