@@ -82,8 +82,8 @@ def _made() -> dict[str, np.ndarray]:
 
     above = 1 / (1 + np.exp(-4 * y))[..., None]
     overcast = above * (0.4 + 0.6 * np.maximum(y, 0)[..., None]) * (1.0, 1.0, 1.0) + (1 - above) * 0.1
-    evening = above * (0.25, 0.4, 0.75) + (1 - above) * (0.12, 0.1, 0.08) + lobe((1, 0.35, 0.3), (9.0, 4.8, 2.0), 6)
-    window = lobe((-1, 0.6, 0.4), (1.0, 1.05, 1.1), 7) + 0.01
+    evening = above * (0.25, 0.4, 0.75) + (1 - above) * (0.12, 0.1, 0.08) + lobe((1, 0.35, 0.3), (8.0, 4.3, 1.8), 5)
+    window = lobe((-1, 0.6, 0.4), (1.0, 1.05, 1.1), 5) + 0.01
     colors = lobe((1, 0.4, 0), (1.0, 0.35, 0.1), 4) + lobe((-1, 0.4, 0), (0.1, 0.35, 1.0), 4) + 0.02
     maps = {"overcast": overcast, "evening": evening, "one window": window, "orange and blue": colors}
     return {name: np.ascontiguousarray(pixels, np.float32) for name, pixels in maps.items()}

@@ -17,7 +17,7 @@ from warp_gi.techniques.radiance_transfer.viewer.pages import faces_kept
 IMAGE_QUALITY = 88
 """Quality of embedded images, of 100; alpha is kept as it is."""
 SMALLEST_IMAGE = 64
-"""Images are not made smaller than this [pixels]."""
+"""Images are not made smaller than this [pixels], and those of less are kept without loss."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,5 +109,5 @@ def image_file(texture: Texture, has_alpha: bool, step: int) -> bytes:
     if tuple(size) != image.size:
         image = image.resize((size[0], size[1]), Image.Resampling.BOX)
     file = io.BytesIO()
-    image.save(file, "WEBP", quality=IMAGE_QUALITY, exact=True)
+    image.save(file, "WEBP", quality=IMAGE_QUALITY, lossless=max(size) <= SMALLEST_IMAGE, exact=True)
     return file.getvalue()
