@@ -21,7 +21,7 @@ from warp_gi.techniques.radiance_transfer.estimator import RadianceTransfer
 from warp_gi.techniques.radiance_transfer.viewer.page import write_view
 
 SIZE = (320, 220)
-CAMERA = gi.Camera.look_at((2.6, 3.4, 3.4), (-0.1, 0.9, -0.1), hfov=62, resolution=SIZE)
+CAMERA = gi.Camera.look_at((1.6, 2.7, 2.6), (-0.2, 1.1, -0.4), hfov=75, resolution=SIZE)
 ESTIMATOR = RadianceTransfer(resolution=96, first_rays=16, rays=64, bounce_rays=16, sun=0.0)
 SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--force-color-profile=srgb")
 READY = "html[data-ready]"
@@ -43,7 +43,7 @@ def scene():
     x = np.linspace(0, 255, 16)
     pixels = np.stack(np.broadcast_arrays(x[:, None], x, 255 - x, 255), axis=-1).astype(np.uint8)
     floor = Material("floor", (0.9, 0.8, 0.7), specular=0.0, base_color_texture=Texture("ramp", pixels))
-    lamp = Material("lamp", (0.5, 0.5, 0.5), specular=0.0, emission=(0.05, 0.1, 0.4), double_sided=False)
+    lamp = Material("lamp", (0.5, 0.5, 0.5), specular=0.0, emission=(0.2, 0.4, 1.2), double_sided=False)
     materials = {"floor": floor, "back": lamp}
     nodes = []
     for node in made.nodes:
@@ -97,6 +97,8 @@ def test_the_picture_is_that_of_the_renderer(browser, written, scene, bake, turn
     assert picture.shape == expected.shape and expected.std() > 20
     difference = metrics.psnr(picture / 255.0, expected / 255.0)
     assert difference > 35, difference
+    off = picture.astype(float) - expected  # edges are all that is off by more than rounding
+    assert np.abs(off).mean() < 0.5 and np.abs(off.mean(axis=(0, 1))).max() < 0.15
     assert metrics.psnr(picture / 255.0, rendered(scene, bake, turn + 30) / 255.0) < 30  # it would tell
 
 
@@ -134,7 +136,7 @@ def test_what_moves_it(browser, written):
         assert state()[2] == pytest.approx(start[2] / 1.05**5)
         page.keyboard.press("r")
         assert state() == start
-        assert np.array_equal(seen(page), first)
+        assert np.array_equal(seen(page)[4:-4, 4:-4], first[4:-4, 4:-4])  # within the frame of what has the keys
 
 
 def test_the_panel(browser, written):
@@ -164,7 +166,7 @@ def test_a_narrow_window_shows_all_of_the_view(browser, written):
         page.wait_for_selector(READY, timeout=60000)
         assert page.eval_on_selector("#view", "c => [c.width, c.height]") == [220, 400]
         assert not page.eval_on_selector("#panel", "d => d.open")
-        assert page.evaluate("viewer.view.slopes(220 / 400)")[0] == pytest.approx(np.tan(np.radians(31)))
+        assert page.evaluate("viewer.view.slopes(220 / 400)")[0] == pytest.approx(np.tan(np.radians(37.5)))
 
 
 def test_a_damaged_page_says_so(browser, written, tmp_path):
