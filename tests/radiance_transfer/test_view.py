@@ -52,12 +52,13 @@ class Page(HTMLParser):
         """A part of the page, [*shape]."""
         packed = zlib.decompress(base64.b64decode(self.scripts[f"part-{record['part']}"]))
         planes = np.frombuffer(packed, np.uint8).reshape(record["size"], -1)
-        return np.ascontiguousarray(planes.T).view(kind).reshape(record["shape"])
+        differences = np.ascontiguousarray(planes.T).view(f"<u{record['size']}").reshape(record["shape"])
+        return np.cumsum(differences, axis=-1, dtype=differences.dtype).view(kind)
 
     def texels(self, page, side):
         """Numbers of one side of a page, float64 [height, width, 4 * layers]."""
         record = self.about["pages"][page][side]
-        layers = [np.cumsum(self.array(one, "<i2"), axis=2, dtype=np.int16) for one in record["layers"]]
+        layers = [self.array(one, "<i2") for one in record["layers"]]
         return np.moveaxis(np.concatenate(layers), 0, -1) * np.array(record["steps"])
 
     def shaded(self, page, side, places):
@@ -132,9 +133,9 @@ def test_light_is_that_of_the_bake(written, textures):
     """What the shader adds up at points of faces against sums over slots."""
     atlas = textures.atlas
     about = written.about
-    places = written.array(about["places"], "<f4").astype(np.float64)
-    triangles = written.array(about["triangles"], "<u4")
-    positions = written.array(about["positions"], "<f4")
+    places = written.array(about["places"], "<f4").T.astype(np.float64)
+    triangles = written.array(about["triangles"], "<u4").T
+    positions = written.array(about["positions"], "<f4").T
     compared = 0
     for group in about["groups"]:
         for triangle in triangles[group["first"] : group["first"] + group["count"]]:

@@ -25,12 +25,12 @@ class Drawing {
     gl.bindVertexArray(this.vertices);
     for (const [location, name, size] of [[0, "positions", 3], [1, "places", 2], [2, "uvs", 2]]) {
       gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-      gl.bufferData(gl.ARRAY_BUFFER, await numbersOf(about[name], Float32Array), gl.STATIC_DRAW);
+      gl.bufferData(gl.ARRAY_BUFFER, interleaved(await numbersOf(about[name]), size), gl.STATIC_DRAW);
       gl.enableVertexAttribArray(location);
       gl.vertexAttribPointer(location, size, gl.FLOAT, false, 0, 0);
     }
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, await numbersOf(about.triangles, Uint32Array), gl.STATIC_DRAW);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, interleaved(await numbersOf(about.triangles), 3), gl.STATIC_DRAW);
     gl.bindVertexArray(null);
     this.white = this.image(new Uint8Array([255, 255, 255, 255]), { srgb: false, wrap: ["repeat", "repeat"] });
     this.images = [];
@@ -40,7 +40,7 @@ class Drawing {
       this.pages.push([]);
       for (const record of sides) this.pages.at(-1).push(record && (await this.page(record)));
     }
-    for (const sky of about.skies) this.maps.push(this.map(sky.map, await mapTexels(sky.map)));
+    for (const sky of about.skies) this.maps.push(this.map(sky.map, interleaved(await numbersOf(sky.map), 3, 4)));
     const error = gl.getError();
     if (error === gl.OUT_OF_MEMORY) throw new Error("this device has too little graphics memory for the bake");
     if (error) throw new Error(`WebGL error ${error}`);

@@ -157,9 +157,9 @@ def _fixed(scene: Scene, shown: Surfaces, sky_list: list[skies.PageSky]) -> _Fix
     directions, weights = harmonics.sphere(2 * LIGHT_ORDER - 2)
     about = {
         "name": scene.name,
-        "positions": parts.add(shown.positions),
-        "uvs": parts.add(shown.uvs),
-        "triangles": parts.add(shown.triangles),
+        "positions": parts.add(shown.positions.T),
+        "uvs": parts.add(shown.uvs.T),
+        "triangles": parts.add(shown.triangles.T),
         "groups": shown.groups,
         "bounds": scene.bounds.tolist(),
         "sphere": np.column_stack([directions, weights]).round(9).tolist(),
@@ -220,7 +220,7 @@ def _fitted(atlas: Atlas, rows: Rows, shown: Surfaces, fixed: _Fixed, largest_mb
             "layers": rows.layers,
             "components": np.round(rows.components, 7).tolist(),
             "hasBounces": bool(len(rows.components)) or rows.has_lamps,
-            "places": parts.add(_places(atlas, shown, detail.block)),
+            "places": parts.add(_places(atlas, shown, detail.block).T),
             "pages": _page_parts(atlas, rows, shown, detail, parts, limit),
             "notes": [*fixed.about["notes"], *filter(None, [said])],
         }
@@ -247,7 +247,7 @@ def _page_parts(
             if (page, side) in drawn and parts.nbytes <= limit:
                 layers: list[dict[str, Any]] = []
                 for texels in pages.page_layers(atlas, rows, page, side, detail.block, steps):
-                    layers.append(parts.add_differences(texels))
+                    layers.append(parts.add(texels))
                     if parts.nbytes > limit:
                         break
                 size = pages.page_size(atlas, page, detail.block)

@@ -1,4 +1,4 @@
-"""Arrays in a page: bytes parted by place in their number, deflated, in base64."""
+"""Arrays in a page: differences of numbers, bytes parted by their place in these, deflated, in base64."""
 
 from __future__ import annotations
 
@@ -28,20 +28,16 @@ class Parts:
     def add(self, array: np.ndarray) -> dict[str, Any]:
         """Add an array, and return what says how it is read: number of the part, bytes of a number, and shape.
 
-        The lowest bytes of all numbers come first, then the next ones: neighbours of one place are alike, which is
-        what deflate finds.
+        Bits of numbers, as whole ones, are kept as differences from those before them on the last axis: neighbours are
+        alike. The lowest bytes of all come first, then the next ones, which is what deflate makes most of.
         """
-        array = np.ascontiguousarray(array)
         size = array.dtype.itemsize
-        planes = array.astype(array.dtype.newbyteorder("<")).view(np.uint8).reshape(-1, size).T
+        numbers = np.ascontiguousarray(array, array.dtype.newbyteorder("<")).view(f"<u{size}")
+        differences = numbers.copy()
+        differences[..., 1:] -= numbers[..., :-1]  # modulo 2^bits
+        planes = differences.reshape(-1).view(np.uint8).reshape(-1, size).T
         self.texts.append(base64.b64encode(zlib.compress(planes.tobytes(), LEVEL)).decode("ascii"))
         return {"part": len(self.texts) - 1, "size": size, "shape": list(array.shape)}
-
-    def add_differences(self, numbers: np.ndarray) -> dict[str, Any]:
-        """Add int16 [..., width] as differences from the number on the left."""
-        differences = numbers.copy()
-        differences[..., 1:] -= numbers[..., :-1]  # modulo 2^16
-        return self.add(differences)
 
     def add_file(self, data: bytes) -> dict[str, Any]:
         """Add a file as it is, and return the number of the part."""

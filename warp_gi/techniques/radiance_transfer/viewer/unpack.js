@@ -9,48 +9,40 @@ function bytesOf(number) {
   return bytes;
 }
 
-async function planesOf(record) {
+// Bits of the numbers of a part, as whole ones: kept are differences along the last axis, lowest bytes first.
+async function numbersOf(record) {
   const stream = new Blob([bytesOf(record.part)]).stream().pipeThrough(new DecompressionStream("deflate"));
   const planes = new Uint8Array(await new Response(stream).arrayBuffer());
   const count = record.shape.reduce((product, size) => product * size, 1);
   if (planes.length !== count * record.size) throw new Error(`part ${record.part} of this page is damaged`);
-  return [planes, count];
-}
-
-// The numbers of a part, in an array of the given type.
-async function numbersOf(record, Type) {
-  const [planes, count] = await planesOf(record);
-  const bytes = new Uint8Array(planes.length);
-  for (let k = 0; k < record.size; k++) {
-    for (let i = 0, from = k * count, to = k; i < count; i++, to += record.size) bytes[to] = planes[from++];
-  }
-  return new Type(bytes.buffer);
-}
-
-// Halves [3, height, width] as texels [height, width, 4].
-async function mapTexels(record) {
-  const halves = await numbersOf(record, Uint16Array);
-  const area = record.shape[1] * record.shape[2];
-  const texels = new Uint16Array(4 * area);
-  for (let c = 0; c < 3; c++) for (let i = 0; i < area; i++) texels[4 * i + c] = halves[c * area + i];
-  return texels;
-}
-
-// A layer of a page, differences [4, height, width] in steps, as texels: Float32Array [height, width, 4].
-async function layerTexels(record, steps) {
-  const [planes, count] = await planesOf(record);
-  const [, height, width] = record.shape;
-  const texels = new Float32Array(count);
-  for (let c = 0, from = 0; c < 4; c++) {
-    for (let y = 0, to = c; y < height; y++) {
-      let value = 0;
-      for (let x = 0; x < width; x++, from++, to += 4) {
-        value = ((value + (planes[from] | (planes[from + count] << 8))) << 16) >> 16;
-        texels[to] = value * steps[c];
-      }
+  const numbers = record.size === 2 ? new Uint16Array(count) : new Uint32Array(count);
+  const width = record.shape.at(-1);
+  for (let first = 0; first < count; first += width) {
+    let value = 0;
+    for (let i = first; i < first + width; i++) {
+      let difference = 0;
+      for (let k = record.size - 1; k >= 0; k--) difference = (difference << 8) | planes[k * count + i];
+      value = (value + difference) | 0;
+      numbers[i] = value;
     }
   }
-  return texels;
+  return numbers;
+}
+
+// Numbers [channels, n] as [n, size], those of channels that are missing 0.
+function interleaved(numbers, channels, size = channels) {
+  const count = numbers.length / channels;
+  const result = new numbers.constructor(count * size);
+  for (let c = 0, from = 0; c < channels; c++) {
+    for (let i = 0, to = c; i < count; i++, to += size) result[to] = numbers[from++];
+  }
+  return result;
+}
+
+// A layer of a page, multiples of steps [4, height, width], as texels: Float32Array [height, width, 4].
+async function layerTexels(record, steps) {
+  const numbers = interleaved(await numbersOf(record), 4);
+  return Float32Array.from(numbers, (number, i) => ((number << 16) >> 16) * steps[i & 3]);
 }
 
 async function imageOf(record) {
