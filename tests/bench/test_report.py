@@ -5,15 +5,13 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
-import os
 import re
-import shutil
-from contextlib import contextmanager
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browser_tools import missing, opened_page, started_browser
 
 import warp_gi as gi
 from warp_gi.bench.harness import records
@@ -355,11 +353,6 @@ def test_mistakes_are_one_line(arguments, words, tmp_path, monkeypatch, capfd):
 # ---- in a browser ----
 
 
-def missing(reason):
-    """Skip the test, or fail it where WARP_GI_BROWSER says that a browser is required."""
-    (pytest.fail if os.environ.get("WARP_GI_BROWSER") == "required" else pytest.skip)(reason)
-
-
 def test_a_required_browser_is_no_reason_to_skip(monkeypatch):
     monkeypatch.setenv("WARP_GI_BROWSER", "required")
     with pytest.raises(pytest.fail.Exception, match="no driver"):
@@ -371,17 +364,8 @@ def test_a_required_browser_is_no_reason_to_skip(monkeypatch):
 
 @pytest.fixture(scope="module")
 def browser():
-    try:
-        import playwright.sync_api as driver
-    except ImportError:
-        missing("no driver: pip install '.[browser]'")
-    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if found is None:
-        missing("no Chromium on the path: apt-get install chromium")
-    with driver.sync_playwright() as p:
-        started = p.chromium.launch(executable_path=found, args=["--no-sandbox"])
+    with started_browser() as started:
         yield started
-        started.close()
 
 
 @pytest.fixture
@@ -392,21 +376,6 @@ def page(browser, written):
         opened.wait_for_selector(".viewer[data-ready]", timeout=10000)
         set_exposure(opened, 0)
         yield opened
-
-
-@contextmanager
-def opened_page(browser, path, width=1280):
-    """A report, offline; at the end nothing must have failed or have been asked of a network."""
-    context = browser.new_context(viewport={"width": width, "height": 900}, offline=True)
-    opened, messages, requests = context.new_page(), [], []
-    opened.on("console", lambda message: messages.append(message.text))
-    opened.on("pageerror", lambda error: messages.append(str(error)))
-    opened.on("request", lambda request: requests.append(request.url))
-    opened.goto(path.as_uri())
-    yield opened
-    assert messages == []
-    assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
-    context.close()
 
 
 def set_exposure(page, stops):

@@ -71,6 +71,8 @@ class BakeOptions(SceneOptions):
     """File for the bake as textures for other programs, beside a .json that says how to read them; see above."""
     export_components: Annotated[int, flag("N", "all")] = 0
     """Number of principal components to export in place of all numbers, where a technique can; see above."""
+    view: Annotated[Path | None, flag("FILE", "none")] = None
+    """Page, .html, that shows the bake in a browser and needs no network, where a technique has one; see above."""
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print nothing but errors."""
     settings: Annotated[Estimator, tyro.conf.arg(name="")] = field(
@@ -127,6 +129,7 @@ def description() -> str:
     for name, title in titles.items():
         tool = tool_of(name)
         said = [*tool.summary, *_labelled("--show: ", tool.shows), *_labelled("--export: ", tool.exports)]
+        said += _labelled("--view: ", tool.views)
         lines += [f"  {head:<{width}}{line}" for head, line in zip([title, *[""] * len(said)], said, strict=False)]
         asked = "" if name == DEFAULT_TECHNIQUE else f" --technique {name}"
         for example in tool.examples:
@@ -153,19 +156,22 @@ def run(options: BakeOptions, report: Reporter) -> None:
     if options.export_components and (options.export is None or not tool.compresses):
         names = " or ".join(name for name in BAKEABLE if tool_of(name).compresses)
         raise OptionError(f"--export-components goes with --export of {names}; leave it out")
+    if options.view is not None:
+        tool.check_view(options.settings, options.view)
     resolution = parse_resolution(options.picture) if options.picture else None
     with report.phase("scene"):
         scene = find_scene(options)
+        shows = options.show is not None or options.view is not None
         is_of_view = has_camera(options, scene) or not tool.finds_places
-        camera = find_camera(options, scene, report) if is_of_view or options.show is not None else None
+        camera = find_camera(options, scene, report) if is_of_view or shows else None
     if resolution and camera is not None:
         camera = camera.at_resolution(*resolution)
     report.line(f"{scene.name}: {scene.triangle_count:,} triangles")
     tool.check_scene(options.settings, scene)
-    for file in (output, options.export):
+    for file in (output, options.export, options.view):
         if file is not None and file.is_dir():
             raise OptionError(f"{file}: is a folder; name a file in it")
-    folders = [output.parent, options.show, options.export and options.export.parent]
+    folders = [output.parent, options.show, *(file and file.parent for file in (options.export, options.view))]
     for folder in filter(None, folders):
         check_writable(folder)
     remove_stale_parts(output)
@@ -189,6 +195,10 @@ def run(options: BakeOptions, report: Reporter) -> None:
             files = tool.export(result, options.export, scene, options.export_components)
         more = f" to {files[-2].name}" * (len(files) > 2)
         report.line(f"{tool.exported}: {files[0]}{more}, described by {files[-1]}")
+    if options.view is not None and camera is not None:
+        with report.phase("view"):
+            page = tool.view(result, scene, first_view(camera), options.view)
+        report.line(f"view: {page}")
     if options.show is not None and camera is not None:
         show(options, options.show, scene, camera, result, report)
     rows = [*tool.rows(result, seconds), ("file [MB]", output.stat().st_size / 1e6)]
@@ -208,10 +218,14 @@ def show(
     if tool.needs_sky and (scene.environment is None or scene.environment.is_black):
         report.line("there is no sky: the pictures are made under a white one")
         scene.environment = 1.0
-    view = camera.camera(0) if isinstance(camera, CameraPath) else camera
     with report.phase("pictures"):
-        tool.write_pictures(scene, view, result, options.settings, folder, options.device, options.seed)
+        tool.write_pictures(scene, first_view(camera), result, options.settings, folder, options.device, options.seed)
     report.line(f"pictures: {folder}")
+
+
+def first_view(camera: Camera | CameraPath) -> Camera:
+    """Return the camera of the first frame."""
+    return camera.camera(0) if isinstance(camera, CameraPath) else camera
 
 
 def default_output(options: BakeOptions) -> Path:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import ClassVar, Generic, NamedTuple, TypeVar
 
 from warp_gi.baking import Bake
+from warp_gi.errors import OptionError
 from warp_gi.estimator import Estimator
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.scene import Scene
@@ -50,6 +51,8 @@ class BakeTool(ABC, Generic[Settings]):
     """Word for the files of an export, as "textures"."""
     compresses: ClassVar[bool] = False
     """Whether an export can hold principal components of something, so that ``components`` may be above 0."""
+    views: ClassVar[Sequence[str]] = ()
+    """Lines of the command's help that say what the page of ``view`` shows; none where there is no page."""
     needs_sky: ClassVar[bool] = False
     """Whether its pictures show nothing without a sky, so that a white sky stands in for one."""
     finds_places: ClassVar[bool] = False
@@ -73,6 +76,14 @@ class BakeTool(ABC, Generic[Settings]):
 
         ``components`` is the number of principal components to compress to; 0 compresses nothing.
         """
+
+    def check_view(self, settings: Settings, path: Path) -> None:
+        """Raise OptionError for a page that ``view`` cannot write; here for every one."""
+        raise OptionError(f"--view is not known to bakes for {self.settings.__name__}; leave it out")
+
+    def view(self, bake: Bake, scene: Scene, camera: Camera, path: Path) -> Path:
+        """Write a page that shows the bake in a browser, at first as the camera sees it, and return its path."""
+        raise NotImplementedError
 
     @abstractmethod
     def write_pictures(

@@ -16,6 +16,7 @@ from warp_gi.techniques.radiance_transfer import pictures
 from warp_gi.techniques.radiance_transfer.estimator import RadianceTransfer
 from warp_gi.techniques.radiance_transfer.pca import CHANNELS
 from warp_gi.techniques.radiance_transfer.textures import transfer_textures
+from warp_gi.techniques.radiance_transfer.viewer import page
 
 
 class RadianceTransferTool(BakeTool[RadianceTransfer]):
@@ -31,9 +32,11 @@ class RadianceTransferTool(BakeTool[RadianceTransfer]):
         "for NAME.exr the coefficients, NAME.rgba.exr the same by fours, and NAME.glb,",
         "the surfaces with the coordinates of the atlas; --export-components is of its bounces",
     )
+    views = ("the matt surfaces under skies that the mouse turns, in WebGL2; at most 30 MB",)
     examples = (
         "hall.glb --resolution 2048 --order 6",
         "atrium --export out/a.exr --export-components 16 --show out/atrium_transfer",
+        "sphere_row --resolution 256 --view out/spheres.html",
     )
     exported = "textures"
     compresses = True
@@ -63,6 +66,16 @@ class RadianceTransferTool(BakeTool[RadianceTransfer]):
     def export(self, bake: Bake, path: Path, scene: Scene, components: int) -> list[Path]:
         """Write images, surfaces and their description."""
         return export_files.export_textures(bake, path, scene, components)
+
+    def check_view(self, settings: RadianceTransfer, path: Path) -> None:
+        """Raise OptionError unless the file is an .html, and the bake is one of texels."""
+        page.check_view_name(path)
+        if settings.storage == "vertices":
+            raise OptionError("a view shows texels, not vertices; bake with --storage texture to view it")
+
+    def view(self, bake: Bake, scene: Scene, camera: Camera, path: Path) -> Path:
+        """Write the page."""
+        return page.write_view(bake, scene, camera, path)
 
     def write_pictures(
         self, scene: Scene, camera: Camera, bake: Bake, settings: RadianceTransfer, folder: Path, device: str, seed: int
