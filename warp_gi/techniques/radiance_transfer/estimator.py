@@ -63,7 +63,7 @@ class RadianceTransfer(Estimator, RadianceCache):
     order: int = 5
     """Order of the spherical harmonics of transfer: 5 (25 numbers a texel) or 6 (36), which halves the error of glossy
     light."""
-    first_rays: int = 64
+    first_rays: int = 128
     """Rays a texel before it is known whether it sees both sky and surfaces."""
     rays: int = 512
     """Rays a texel that does."""
@@ -71,7 +71,7 @@ class RadianceTransfer(Estimator, RadianceCache):
     """Rays a texel that find the surfaces from which light bounces."""
     bounces: int = 16
     """Largest number of bounces."""
-    tolerance: float = 0.002
+    tolerance: float = 0.0005
     """Share of all light that a bounce has to add, or there is no further one."""
     sun: float = 20.0
     """Radiance, in means of the sky, above which light is a sun's: it leaves the harmonics of direct light and gets a
