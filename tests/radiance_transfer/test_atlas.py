@@ -132,7 +132,7 @@ def test_gbuffer_is_that_of_the_slow_search(small):
         point = corners[face].T @ [1 - u - v, u, v] - center
         assert np.abs(point).max() <= 1 + 3 * MARGIN
         if distances:  # the square's edge alone is a matter of rounding
-            assert np.linalg.norm(point) == pytest.approx(min(distances.values()), abs=3 * MARGIN)
+            assert np.linalg.norm(point) == pytest.approx(min(distances.values()), abs=6 * MARGIN)
             equal = [other for other, distance in distances.items() if distance < 1e-9]
             if equal and min(np.abs(found[f]).max() for f in equal) == 0 and covered_by(corners[equal] - center):
                 assert face == min(equal)
