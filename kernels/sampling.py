@@ -65,6 +65,12 @@ SET_SKY_DIMENSION = wp.constant(1)
 SET_SKY_DIGITS_DIMENSION = wp.constant(2)  # random
 SET_COSINE_DIMENSION = wp.constant(3)
 
+# A bake of radiance transfer: the directions of a set by their number in it, the others by slot (lamps by sample).
+TRANSFER_DIRECTION_DIMENSION = wp.constant(0)
+TRANSFER_TURN_DIMENSION = wp.constant(1)  # turn of the slot's set about the normal (random)
+TRANSFER_LAMP_DIMENSION = wp.constant(2)  # which lamp, and its further digits (random),
+TRANSFER_POINT_DIMENSION = wp.constant(3)  # and the point on it
+
 # Pixels lit by a visibility field.
 FIELD_BSDF_DIMENSION = wp.constant(101)  # the direction by the BSDF; random: which of these samples are verified
 FIELD_LIGHT_DIMENSION = wp.constant(102)  # which light samples are verified (random)

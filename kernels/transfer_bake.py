@@ -11,7 +11,10 @@ from warp_gi.kernels.bvh import bvh_intersect, bvh_occluded
 from warp_gi.kernels.emitters import LightChoice, sample_emitter
 from warp_gi.kernels.light_connections import SHADOW_END
 from warp_gi.kernels.sampling import (
-    OWN_DIMENSION,
+    TRANSFER_DIRECTION_DIMENSION,
+    TRANSFER_LAMP_DIMENSION,
+    TRANSFER_POINT_DIMENSION,
+    TRANSFER_TURN_DIMENSION,
     circle,
     cosine_direction,
     hash_uint,
@@ -29,11 +32,6 @@ wp.set_module_options({"enable_backward": False})
 SETS = wp.constant(64)  # of directions
 SKY = wp.constant(-1)  # a ray that hits nothing
 BLACK = wp.constant(-2)  # a ray that hits what keeps no transfer, or starts below the surface
-DIRECTION_DIMENSION = OWN_DIMENSION  # directions of a set, by their number
-TURN_DIMENSION = wp.constant(3001)  # by slot, from here on: turn of its set (random)
-LAMP_DIMENSION = wp.constant(3002)  # which lamp,
-LAMP_DIGITS_DIMENSION = wp.constant(3003)  # its further digits (random),
-LAMP_POINT_DIMENSION = wp.constant(3004)  # and the point on it
 
 
 # Where the slots are: see warp_gi/techniques/radiance_transfer/textures.py.
@@ -68,7 +66,7 @@ class TransferResults:
 def draw_directions(first: wp.int32, rays: TransferRays):
     k = first + wp.tid()
     seed = hash_uint(rays.seed + wp.uint32(k / rays.set_size))
-    d = cosine_direction(sample_2d(wp.uint32(k % rays.set_size), seed, DIRECTION_DIMENSION))
+    d = cosine_direction(sample_2d(wp.uint32(k % rays.set_size), seed, TRANSFER_DIRECTION_DIMENSION))
     for axis in range(3):
         rays.directions[axis, k] = d[axis]
 
@@ -94,7 +92,7 @@ def set_start(rays: TransferRays, slot: wp.int32) -> wp.int32:
 # world_from_local of a slot's directions: its shading frame, turned about the normal.
 @wp.func
 def set_frame(rays: TransferRays, shading: wp.mat33, slot: wp.int32) -> wp.mat33:
-    c = circle(random_1d(wp.uint32(slot), rays.seed, TURN_DIMENSION))
+    c = circle(random_1d(wp.uint32(slot), rays.seed, TRANSFER_TURN_DIMENSION))
     x = wp.vec3(shading[0, 0], shading[1, 0], shading[2, 0])
     y = wp.vec3(shading[0, 1], shading[1, 1], shading[2, 1])
     return wp.matrix_from_cols(
@@ -200,17 +198,35 @@ def trace_transfer(
         results.transfer[slot, k] = wp.float16(exact[k])
 
 
-# Thread: a slot, from slot `start` on. Irradiance by the scene's emitters, from `samples` of them by power; or, where
-# `each` is set, from each of them once.
+# How lamps are sampled at a slot.
+@wp.struct
+class LampSamples:
+    count: wp.int32
+    each: wp.int32  # 1: a sample is the emitter of its number; 0: emitters are drawn by power
+    seed: wp.uint32
+
+
+# Sample k of a slot.
+@wp.func
+def lamp_choice(scene: SceneData, lamps: LampSamples, index: wp.uint32, k: wp.int32) -> LightChoice:
+    choice = LightChoice(k, 1.0, 1.0, 0, 0, 0.0)
+    if lamps.each == 0:
+        u = sample_1d(index, lamps.seed, TRANSFER_LAMP_DIMENSION)
+        digits = random_1d(index, lamps.seed, TRANSFER_LAMP_DIMENSION)
+        a = alias_choice(scene.emitters.alias, scene.emitters.count, u, digits)
+        choice.item = a.item
+        choice.pdf = a.pdf * wp.float32(lamps.count)
+    return choice
+
+
+# Thread: a slot, from slot `start` on. Irradiance by the scene's emitters.
 @wp.kernel
 def light_slots(
     first: wp.int32,
     start: wp.int32,
     scene: SceneData,
     slots: TransferSlots,
-    samples: wp.int32,
-    each: wp.int32,
-    seed: wp.uint32,
+    lamps: LampSamples,
     result: wp.array(dtype=wp.vec3),
 ):
     slot = start + first + wp.tid()
@@ -218,17 +234,10 @@ def light_slots(
     origin = ray_origin(s)
     n = shading_normal(s)
     sum = wp.vec3()
-    for k in range(samples):
-        index = wp.uint32(slot) * wp.uint32(samples) + wp.uint32(k)
-        choice = LightChoice(k, 1.0, 1.0, 0, 0, 0.0)
-        if each == 0:
-            u = sample_1d(index, seed, LAMP_DIMENSION)
-            a = alias_choice(
-                scene.emitters.alias, scene.emitters.count, u, random_1d(index, seed, LAMP_DIGITS_DIMENSION)
-            )
-            choice.item = a.item
-            choice.pdf = a.pdf * wp.float32(samples)
-        e = sample_emitter(scene, origin, choice, sample_2d(index, seed, LAMP_POINT_DIMENSION))
+    for k in range(lamps.count):
+        index = wp.uint32(slot) * wp.uint32(lamps.count) + wp.uint32(k)
+        choice = lamp_choice(scene, lamps, index, k)
+        e = sample_emitter(scene, origin, choice, sample_2d(index, lamps.seed, TRANSFER_POINT_DIMENSION))
         cosine = wp.dot(e.direction, n)
         if e.pdf > 0.0 and cosine > 0.0 and wp.dot(e.direction, s.normal) > 0.0:
             if bvh_occluded(scene.bvh, origin, e.direction, e.distance * SHADOW_END) == 0:

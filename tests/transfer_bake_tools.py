@@ -73,7 +73,10 @@ def slow_bake(scene: Scene, rays: int = 64, bounces: int = 3, seed: int = 1, **c
 
 
 def random_bake(scene: Scene, order: int = 5, seed: int = 5, **changes) -> TransferTextures:
-    """Return random numbers on two pages of unequal sizes, of which the first is seen from behind in a part."""
+    """Return random numbers on two pages of unequal sizes, of which the first is seen from behind in a part.
+
+    Some texels have lost their slots, so that something is missing between others.
+    """
     one = make_atlas(scene, settings(**{"resolution": 48, **changes}), "cpu")
     (_, width, height), rng = one.pages[0], np.random.default_rng(seed)
     wide, high = width + 5, height + 3
@@ -88,6 +91,7 @@ def random_bake(scene: Scene, order: int = 5, seed: int = 5, **changes) -> Trans
     slots = np.full((2, len(owners)), -1, np.int32)
     slots[0][owners >= 0] = np.arange((owners >= 0).sum())
     slots[1][backs >= 0] = np.arange((owners >= 0).sum(), len(faces))
+    slots[rng.random(slots.shape) < 0.1] = -1
     count = len(faces)
     atlas = Atlas(
         corners=one.corners,

@@ -123,8 +123,15 @@ def test_paths_that_measure_reach_do_not_meet():
             (RANDOM, d.FIELD_LOBE_DIMENSION),
             (RANDOM, d.FIELD_SET_DIMENSION),
         ],
+        [
+            (STRATIFIED, d.TRANSFER_DIRECTION_DIMENSION),
+            (RANDOM, d.TRANSFER_TURN_DIMENSION),
+            (STRATIFIED, d.TRANSFER_LAMP_DIMENSION),
+            (RANDOM, d.TRANSFER_LAMP_DIMENSION),
+            (STRATIFIED, d.TRANSFER_POINT_DIMENSION),
+        ],
     ],
-    ids=["visibility bake", "sets", "visibility field"],
+    ids=["visibility bake", "sets", "visibility field", "transfer bake"],
 )
 def test_numbers_of_a_launch_do_not_meet(launch):
     assert all(a != b for a, b in combinations(launch, 2))

@@ -23,8 +23,8 @@ from warp_gi import launch
 from warp_gi.techniques.radiance_transfer import chart_cache, chart_worker, charts
 from warp_gi.techniques.radiance_transfer.atlas import make_atlas
 from warp_gi.techniques.radiance_transfer.densities import automatic_factors, density_factors, parse_texel_sets
+from warp_gi.techniques.radiance_transfer.islands import islands
 from warp_gi.techniques.radiance_transfer.textures import Atlas
-
 
 RUN = charts.ChartJob.run
 
@@ -429,10 +429,20 @@ def test_progress_rises_to_1():
     assert told == sorted(told) and told[-1] == 1.0 and len(told) >= 4
 
 
-def test_large_parts_are_split(monkeypatch):
+def test_large_islands_are_split(monkeypatch):
     monkeypatch.setattr(charts, "MOST_FACES", 50)
-    centers = np.random.default_rng(0).random((300, 3))
-    parts = np.repeat([3, 7], [280, 20])
-    split = charts.split_parts(centers, parts)
-    assert np.bincount(split).max() <= 50 and split.max() + 1 == 9
-    assert all(len(set(parts[split == part])) == 1 for part in range(9))
+    large, small = ball(rings=12), [ball((3 * k, 5, 0), rings=3) for k in range(5)]
+    points = np.concatenate([mesh.points[mesh.indices] for mesh in (large, *small)])
+    owner = np.repeat(np.arange(6), [len(mesh.indices) for mesh in (large, *small)])
+    split = charts.split_parts(points.astype(np.float64), np.where(owner < 5, 4, 9))
+    assert np.array_equal(np.unique(split), np.arange(split.max() + 1)) and np.bincount(split).max() <= 72
+    for number in range(1, 6):
+        assert len(np.unique(split[owner == number])) == 1
+    assert not np.isin(split[owner == 5], split[owner < 5]).any()
+    assert np.bincount(split[owner == 0]).max() <= 50
+
+
+def test_islands():
+    corners = np.array([[[0], [1], [2]], [[7], [8], [9]], [[2], [3], [4]], [[4], [5], [6]], [[9], [10], [11]]])
+    assert islands(corners).tolist() == [0, 1, 0, 0, 1]
+    assert islands(corners[:0]).shape == (0,)

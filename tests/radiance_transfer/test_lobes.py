@@ -37,9 +37,14 @@ def ggx(roughness, wo, wi):
     return np.where(wi[..., 2] > 0, d * v, 0), (1 - h @ wo) ** 5
 
 
+def gauss(panels):
+    """Nodes and weights on [0, 1], 4 a panel."""
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    return ((np.arange(panels)[:, None] + (nodes + 1) / 2) / panels).ravel(), np.tile(weights / 2 / panels, panels)
+
+
 def hemisphere(rows, columns):
-    z, weights = np.polynomial.legendre.leggauss(rows)
-    z, weights = (z + 1) / 2, weights / 2
+    z, weights = gauss(rows // 4)
     phi = 2 * np.pi * (np.arange(columns) + 0.5) / columns
     ring = np.sqrt(1 - z * z)[:, None]
     d = np.stack([ring * np.cos(phi), ring * np.sin(phi), z[:, None] + 0 * phi], axis=-1).reshape(-1, 3)
@@ -47,8 +52,7 @@ def hemisphere(rows, columns):
 
 
 def test_phong_factors():
-    x, weights = np.polynomial.legendre.leggauss(1500)
-    x, weights = (x + 1) / 2, weights / 2
+    x, weights = gauss(400)
     for s in (0.0, 0.5, 1.0, 2.0, 4.0, 7.3, 16.0, 300.0):
         lobe = (s + 2) * x**s
         expected = [weights @ (lobe * np.polynomial.legendre.Legendre.basis(l)(x)) for l in range(7)]
@@ -72,9 +76,10 @@ def test_phong_keeps_the_energy_of_a_white_furnace():
 
 @pytest.mark.parametrize("roughness", [0.35, 0.6, 1.0])
 def test_quadrature_of_ggx(roughness):
-    d, weights = hemisphere(256, 512)
-    wi, found, fresnel = ggx_directions(roughness, COSINES)
-    for k, wo in enumerate(views(COSINES)):
+    d, weights = hemisphere(240, 400)
+    cosines = COSINES[1::2]
+    wi, found, fresnel = ggx_directions(roughness, cosines)
+    for k, wo in enumerate(views(cosines)):
         value, schlick = ggx(roughness, wo, d)
         value *= weights * d[:, 2]
         assert found[k].sum() == pytest.approx(value.sum(), abs=2e-3)
@@ -151,7 +156,7 @@ class Lit:
         return d @ self.walls.T < self.edges
 
     def reflected(self, roughness):
-        wi, weights, _ = ggx_directions(roughness, COSINES, 48, 64)
+        wi, weights, _ = ggx_directions(roughness, COSINES, 40, 40)
         result = np.zeros((len(COSINES), len(self.light)))
         for side in (1, -1):
             d = wi * [1, side, 1]
@@ -161,8 +166,8 @@ class Lit:
 
     def error(self, lobes, expected, order):
         """RMSE over the mean, of lobes [cosines, order^2]."""
-        table = products.tripling(order)
-        found = np.einsum("ijk,ci,cj,vk->vc", table, self.light, self.transfer[:, : order**2], lobes, optimize=True)
+        matrices = products.light_matrix(self.light, order)
+        found = lobes @ np.einsum("ckj,cj->kc", matrices, self.transfer[:, : order**2])
         return np.sqrt(((found - expected) ** 2).mean()) / expected.mean()
 
 
@@ -185,7 +190,7 @@ def about_mirror(roughness, order):
 def test_lobes_of_ggx_are_nearer_than_ones_about_the_mirrored_view():
     lit = Lit()
     errors = {}
-    for roughness in (0.5, 0.6, 0.7, 0.8, 0.9, 1.0):
+    for roughness in (0.5, 0.6, 0.7, 0.9, 1.0):
         expected = lit.reflected(roughness)
         for order in (5, 6):
             table = lobe_table(order)

@@ -27,7 +27,8 @@ def test_a_bake_is_saved_exported_shown_and_told(tmp_path, capsys, monkeypatch):
     files = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
     exported = {f"a/box.{end}" for end in ("exr", "rgba.exr", "glb", "json")}
     shown = {f"pictures/{name}.png" for name in ("charts.page0", "sky.page0", "bounces.page0", "view")}
-    assert files == {"out/cornell_box.transfer.safetensors"} | exported | shown
+    backs = {f"pictures/{name}.page0.back.png" for name in ("charts", "sky", "bounces")}
+    assert files == {"out/cornell_box.transfer.safetensors"} | exported | shown | backs
     assert "textures: a/box.exr to box.glb, described by a/box.json" in told
     bake = gi.load_bake("out/cornell_box.transfer.safetensors")
     textures = transfer_textures(bake)

@@ -70,7 +70,7 @@ def test_suns_turn_with_the_sky():
 
 def test_blobs_across_the_edge_and_at_poles():
     pixels = noise()
-    pixels[14:16, [0, 1, 63]] = 500.0  # across the edge
+    pixels[[14, 14, 15], [0, 1, 63]] = 500.0  # across the edge, by a corner
     pixels[0, [3, 30, 50]] = 4e5  # one point, three texels
     pixels[1, 40] = 500.0  # touches that point
     pixels[31, 5] = 9e5
@@ -81,7 +81,7 @@ def test_blobs_across_the_edge_and_at_poles():
     assert len(towards) == 3 and split.rest.pixels[1, 40, 0] < 100
     for wanted in (direction(0, 0, 32), direction(31, 0, 32)):
         assert (towards @ wanted).max() == pytest.approx(1.0, abs=1e-5)
-    edge = sum(direction(r, c, 32) * node_solid_angles(32, 64)[r] for r in (14, 15) for c in (0, 1, 63))
+    edge = sum(direction(r, c, 32) for r, c in ((14, 0), (14, 1), (15, 63)))
     assert (towards @ (edge / np.linalg.norm(edge))).max() == pytest.approx(1.0, abs=1e-5)
     assert (np.diff(split.irradiances @ [0.2126, 0.7152, 0.0722]) <= 0).all()
 

@@ -15,10 +15,11 @@ from __future__ import annotations
 import hashlib
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import warp as wp
@@ -31,10 +32,12 @@ from warp_gi.launch import get_device, on_device
 from warp_gi.scene import harmonics
 from warp_gi.scene.model import Color
 from warp_gi.scene.sky import SunSky, node_solid_angles
-from warp_gi.scene.sun import MOST_SUNS, MapSplit, SunSplit, split_map
+from warp_gi.scene.sun import LAMPS_SHARE, MOST_SUNS, MapSplit, split_map
 from warp_gi.scene.watching import Watch
 
-__all__ = ["Environment", "SunSky", "as_environment"]
+T = TypeVar("T")
+
+__all__ = ["Environment", "SunSky", "SunSplit", "as_environment"]
 
 LARGEST_HEIGHT = 4096  # texel coordinates must be exact in float32 with bits left to interpolate
 NEGLIGIBLE_NEGATIVE = 1e-4  # share of the sum of all pixels; less is set to 0
@@ -47,8 +50,7 @@ class SkyMap:
         self.pixels = pixels
         self.arrays: dict[str, tuple[wp.array, wp.array, float]] = {}
         self.watch: Watch | None = None
-        self._harmonics: dict[int, np.ndarray] = {}
-        self._splits: dict[tuple[float, int], tuple[MapSplit, SkyMap]] = {}
+        self._derived: dict[Hashable, Any] = {}
 
     @cached_property
     def digest(self) -> bytes:
@@ -60,20 +62,24 @@ class SkyMap:
         height, width = self.pixels.shape[:2]
         return self.pixels.sum(1, dtype=np.float64).T @ node_solid_angles(height, width) / (4 * math.pi)
 
+    def once(self, key: Hashable, make: Callable[[np.ndarray], T]) -> T:
+        """Return ``make(pixels)``, computed once a key."""
+        if key not in self._derived:
+            self._derived[key] = make(self.pixels)
+        return self._derived[key]
+
     def harmonics_of(self, order: int) -> np.ndarray:
-        """Spherical harmonics in the map's own space, float64 [3, order^2]; not to be written to."""
-        if order not in self._harmonics:
-            self._harmonics[order] = harmonics.project(self.pixels, order)
-            self._harmonics[order].flags.writeable = False
-        return self._harmonics[order]
+        """Spherical harmonics in the map's own space, float64 [3, order^2]."""
+        return self.once(("harmonics", order), lambda pixels: harmonics.project(pixels, order))
 
     def split(self, brighter_than: float, most: int) -> tuple[MapSplit, SkyMap]:
         """Return the map's suns, and the map without them."""
-        key = brighter_than, most
-        if key not in self._splits:
-            parts = split_map(self.pixels, brighter_than, most)
-            self._splits[key] = parts, self if parts.pixels is self.pixels else SkyMap(parts.pixels)
-        return self._splits[key]
+
+        def make(pixels: np.ndarray) -> tuple[MapSplit, SkyMap]:
+            parts = split_map(pixels, brighter_than, most)
+            return parts, self if parts.pixels is pixels else SkyMap(parts.pixels)
+
+        return self.once(("split", brighter_than, most), make)
 
     def on(self, device: wp.Device) -> tuple[wp.array, wp.array, float]:
         """Return texels, alias table and scale of densities, arrays on the device."""
@@ -212,6 +218,13 @@ class Environment:
         irradiances = parts.irradiances * self.scale
         return SunSplit(sky, directions, irradiances, parts.cos_cones, parts.cos_discs, parts.share)
 
+    def once_a_map(self, key: Hashable, make: Callable[[np.ndarray], T]) -> T | None:
+        """Return ``make(pixels)``, computed once for all rotations and scales of a map; None for a sky without one.
+
+        ``make`` sees the map in its own space and unscaled. ``key`` tells apart what different callers derive.
+        """
+        return None if self._map is None else self._map.once(key, make)
+
     @property
     def content_hash(self) -> str:
         """Hexadecimal SHA-256 of all that determines the radiance."""
@@ -261,6 +274,34 @@ class Environment:
             arrays = self._map.on(target)
             result.texels, result.alias, result.pdf_scale = arrays
         return result
+
+
+@dataclass(frozen=True, eq=False)
+class SunSplit:
+    """A sky in two parts, which add up to the whole: its suns, and the rest."""
+
+    rest: Environment
+    """The sky without its suns; the sky itself where there are none."""
+    directions: np.ndarray
+    """Unit directions towards the suns in world space, brightest first, float64 [suns, 3]."""
+    irradiances: np.ndarray
+    """Irradiance of a surface that faces a sun, W/m^2, float64 [suns, 3]: the integral of what left the map."""
+    cos_cones: np.ndarray
+    """Cosines of the half-angles of cones that hold all light of each sun, float64 [suns]."""
+    cos_discs: np.ndarray
+    """Cosines of the half-angles of even discs as wide as each sun (of the same second moment), float64 [suns]."""
+    share: float
+    """Share of the sky's light (luminance, from all directions) that the suns hold."""
+
+    @property
+    def warning(self) -> str | None:
+        """One line for those to whom the rest is what counts, where the suns hold most of the light; else None."""
+        if self.share <= LAMPS_SHARE:
+            return None
+        return (
+            f"{self.rest.name}: {len(self.directions)} small lamps hold {self.share:.0%} of this sky's light;"
+            " as spherical harmonics it is a poor likeness, and is better traced"
+        )
 
 
 Sky = Environment | SunSky | str | Path | float | Sequence[float] | np.ndarray | None

@@ -7,6 +7,7 @@ that of band l and degree m from -l to l; kernels/harmonics.py writes out the fi
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import cache
 
 import numpy as np
@@ -15,6 +16,8 @@ from warp_gi.scene.sky import node_solid_angles
 
 # Polar coordinates of a map's own space, y up, as directions with z up: its azimuth runs from -z to +x. A reflection.
 _POLAR_FROM_MAP = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+_POINTS = 3  # between two rows, by which a map is integrated
 
 
 def basis(directions: np.ndarray, order: int = 3) -> np.ndarray:
@@ -56,7 +59,7 @@ def sphere(degree: int) -> tuple[np.ndarray, np.ndarray]:
 def project(pixels: np.ndarray, order: int = 3) -> np.ndarray:
     """Return the coefficients, float64 [3, order^2], of a latitude-longitude map [height, width, 3] in its own space.
 
-    A sum over nodes, as radiance is bilinear between them. Errors are of second order in their distance.
+    At order 3 a sum over nodes, with errors of second order in their distance; else exact for the bilinear map.
     """
     height, width = pixels.shape[:2]
     if order != 3:
@@ -92,33 +95,46 @@ def rotate(coefficients: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 def ring_coefficients(pixels: np.ndarray, order: int) -> np.ndarray:
     """Return complex coefficients [order (degree m), order (band l), 3] of a map, about its own up axis; 0 for l < m.
 
-    The map is sum_m Re((2 - [m = 0]) c_m P_lm(cos polar angle) exp(i m azimuth)) with orthonormal P_lm; made for orders
-    far above ``project``'s. Azimuth is that of ``Environment``: 2 pi u.
+    The map is sum_m Re((2 - [m = 0]) c_m P_lm(cos polar angle) exp(i m azimuth)) with orthonormal P_lm, azimuth 2 pi u
+    as ``Environment`` has it. Exact for radiance that is bilinear between nodes, and fast at high orders.
     """
     height, width = pixels.shape[:2]
     order_seen = min(order, width // 2)  # of higher degrees a map knows nothing
-    theta = np.arange(height) * math.pi / (height - 1)
-    rings = (
-        np.fft.rfft(pixels.astype(np.float64), axis=1)[:, :order_seen] * node_solid_angles(height, width)[:, None, None]
-    )
-    rings *= np.exp(-1j * np.arange(order_seen) * math.pi / width)[:, None]  # the first column stands half a texel in
+    rings = np.empty((order_seen, height, 3), np.complex128)
+    for rows in np.array_split(np.arange(height), max(1, height * width // 65536)):  # so many as fit the cache
+        spectrum = np.fft.rfft(pixels[rows].astype(np.float64), axis=1)[:, :order_seen]
+        rings[:, rows] = spectrum.transpose(1, 0, 2)
+    degrees, step = np.arange(order_seen), math.pi / (height - 1)
+    around = np.sinc(degrees / width) ** 2 * (2 * math.pi / width)  # the integral of what is linear between columns
+    rings *= (around * np.exp(-1j * degrees * math.pi / width))[:, None, None]  # the first column: half a texel in
+    points, weights = np.polynomial.legendre.leggauss(_POINTS)
+    share = (points + 1) / 2  # of the way from a row to the next
+    theta = (np.arange(height - 1)[:, None] + share) * step
+    values = rings[:, :-1, None] * (1 - share)[:, None] + rings[:, 1:, None] * share[:, None]
+    values *= (np.sin(theta) * weights * step / 2)[..., None]
+    values = values.reshape(order_seen, -1, 3)
     result = np.zeros((order, order, 3), np.complex128)
-    for m in range(order_seen):
-        functions = np.stack(_legendre(m, order, np.cos(theta), np.sin(theta)))
-        result[m, m:] = functions @ rings[:, m]
+    for m, functions in enumerate(_ring_functions(theta.ravel(), order, order_seen)):
+        result[m, m:] = (functions @ values[m].view(np.float64)).view(np.complex128)  # real and imaginary parts apart
     return result
 
 
 def ring_pixels(coefficients: np.ndarray, height: int) -> np.ndarray:
-    """Return the map float64 [height, 2 * height, 3] of ``ring_coefficients`` [order, order, 3]."""
+    """Return the map float64 [height, 2 * height, 3] of ``ring_coefficients`` [order, order, 3], at its nodes."""
     order, width = len(coefficients), 2 * height
-    theta = np.arange(height) * math.pi / (height - 1)
     rings = np.zeros((height, height + 1, 3), np.complex128)
-    for m in range(min(order, height)):
-        functions = np.stack(_legendre(m, order, np.cos(theta), np.sin(theta)))
+    theta = np.arange(height) * (math.pi / (height - 1))
+    for m, functions in enumerate(_ring_functions(theta, order, min(order, height))):
         rings[:, m] = functions.T @ coefficients[m, m:]
     rings *= np.exp(1j * np.arange(height + 1) * math.pi / width)[:, None]
     return np.fft.irfft(rings, width, axis=1) * width
+
+
+def _ring_functions(theta: np.ndarray, order: int, degrees: int) -> Iterator[np.ndarray]:
+    """Yield the functions of the polar angle ``theta`` [n] of each degree m, float64 [order - m, n]."""
+    z, ring = np.cos(theta), np.sin(theta)
+    for m in range(degrees):
+        yield np.stack(_legendre(m, order, z, ring))
 
 
 def _from_rings(rings: np.ndarray) -> np.ndarray:

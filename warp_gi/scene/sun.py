@@ -8,15 +8,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from warp_gi.color import LUMINANCE
 from warp_gi.scene.sky import node_solid_angles
-
-if TYPE_CHECKING:
-    from warp_gi.scene.environment import Environment
 
 MOST_SUNS = 8
 """Largest number of suns; what is left over stays in the map."""
@@ -27,36 +23,8 @@ LAMPS_SHARE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class SunSplit:
-    """A sky in two parts, which add up to the whole: its suns, and the rest."""
-
-    rest: Environment
-    """The sky without its suns; the sky itself where there are none."""
-    directions: np.ndarray
-    """Unit directions towards the suns in world space, brightest first, float64 [suns, 3]."""
-    irradiances: np.ndarray
-    """Irradiance of a surface that faces a sun, W/m^2, float64 [suns, 3]: the integral of what left the map."""
-    cos_cones: np.ndarray
-    """Cosines of the half-angles of cones that hold all light of each sun, float64 [suns]."""
-    cos_discs: np.ndarray
-    """Cosines of the half-angles of even discs as wide as each sun (of the same second moment), float64 [suns]."""
-    share: float
-    """Share of the sky's light (luminance, from all directions) that the suns hold."""
-
-    @property
-    def warning(self) -> str | None:
-        """One line for those to whom the rest is what counts, where the suns hold most of the light; else None."""
-        if self.share <= LAMPS_SHARE:
-            return None
-        return (
-            f"{self.rest.name}: {len(self.directions)} small lamps hold {self.share:.0%} of this sky's light;"
-            " as spherical harmonics it is a poor likeness, and is better traced"
-        )
-
-
-@dataclass(frozen=True, eq=False)
 class MapSplit:
-    """What a SunSplit is made of: the parts of a map, in its own space and unscaled."""
+    """What ``environment.SunSplit`` is made of: the parts of a map, in its own space and unscaled."""
 
     pixels: np.ndarray
     """The rest, float32 [height, width, 3]; the map itself where there are no suns."""

@@ -14,7 +14,8 @@ from warp_gi.scene.scene import Scene
 from warp_gi.techniques.radiance_transfer.backs import open_charts
 from warp_gi.techniques.radiance_transfer.charts import ChartJob, Page, cut_charts, packed, surface_sized
 from warp_gi.techniques.radiance_transfer.densities import density_factors
-from warp_gi.techniques.radiance_transfer.own_uvs import islands, why_unfit
+from warp_gi.techniques.radiance_transfer.islands import islands
+from warp_gi.techniques.radiance_transfer.own_uvs import why_unfit
 from warp_gi.techniques.radiance_transfer.settings import TransferSettings
 from warp_gi.techniques.radiance_transfer.texels import covered_texels
 from warp_gi.techniques.radiance_transfer.textures import Atlas
@@ -77,8 +78,12 @@ def _page(
         points[~has_own], parts[~has_own], job, _share_of(progress, 0.0, CUT_SHARE)
     )
     if has_own.any():
-        places = np.concatenate([points[has_own], np.repeat(parts[has_own], 3).reshape(-1, 3, 1)], axis=2)
-        charts[has_own] = islands(places, uvs[has_own]) + charts[~has_own].max(initial=-1) + 1
+        part = np.repeat(parts[has_own], 3).reshape(-1, 3, 1)
+        charts[has_own] = (
+            islands(np.concatenate([points[has_own], uvs[has_own], part], axis=2))
+            + charts[~has_own].max(initial=-1)
+            + 1
+        )
     uvs, charts = surface_sized(points, uvs, charts)
     uvs *= factors[parts].astype(np.float32)[:, None, None]
     return packed(uvs, charts, settings.resolution, job, _share_of(progress, CUT_SHARE, PACKED_SHARE))

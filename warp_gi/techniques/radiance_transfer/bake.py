@@ -78,15 +78,15 @@ def transfer_key(scene: Scene, bounces: bool = True) -> str:
     """
     if bounces:
         return hashlib.sha256(b"warp_gi transfer 1" + scene.contents_hash.encode()).hexdigest()
-    digest = hashlib.sha256(b"warp_gi transfer 1 direct" + scene.geometry_hash.encode())
-    for mesh in (mesh for node in scene.nodes for mesh in node.meshes):
-        texture = mesh.material.normal_texture
-        arrays = [mesh.normals] if texture is None else [mesh.normals, mesh.uvs, texture.pixels]
+    digest, flat = hashlib.sha256(b"warp_gi transfer 1 direct" + scene.geometry_hash.encode()), scene._flat
+    digest.update(flat.normals.tobytes())
+    for index, material in enumerate(scene.materials):
+        texture = material.normal_texture
         if texture is not None:
-            digest.update(repr((mesh.material.normal_scale, texture.wrap)).encode())
-        for array in arrays:
-            digest.update(repr(None if array is None else np.shape(array)).encode())
-            digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+            triangles = flat.materials == index
+            digest.update(repr((texture.wrap, texture.pixels.shape, material.normal_scale)).encode())
+            for array in (texture.pixels, triangles, flat.uvs[flat.indices[triangles]]):
+                digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 
 

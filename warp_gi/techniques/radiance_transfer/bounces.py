@@ -88,16 +88,18 @@ def lamps_move(scene: Scene) -> bool:
 def lamp_irradiance(work: TransferWork, scene: Scene, seed: int, progress: Progress | None = None) -> np.ndarray:
     """Return the irradiance [W/m^2] by light that comes straight from the scene's emitters, float32 [slots, 3].
 
-    Emitters are chosen by power, and a point on them by area: close to a large one this is noisy.
+    Emitters are chosen by power, and a point on them by area. So it is noisy close to a large one, and of use
+    only in means over many slots, as bounces are.
     """
-    data = work.data
-    only_punctual = scene.emitter_count == len(scene.lights) <= LAMP_SAMPLES
-    samples = scene.emitter_count if only_punctual else LAMP_SAMPLES
+    data, lamps = work.data, ray_kernels.LampSamples()
     data.emitters.alias = scene.light_table(work.device)
+    lamps.each = int(scene.emitter_count == len(scene.lights) <= LAMP_SAMPLES)
+    lamps.count = scene.emitter_count if lamps.each else LAMP_SAMPLES
+    lamps.seed = seed & 0xFFFFFFFF
     result = filled((work.count,), wp.vec3, work.device)
 
     def run(start: int, slots: int) -> None:
-        inputs = [start, data, work.slots, samples, int(only_punctual), seed & 0xFFFFFFFF, result]
+        inputs = [start, data, work.slots, lamps, result]
         launch.launch(ray_kernels.light_slots, slots, inputs, work.device, smallest_slice=16)
 
     work.each_batch(run, progress)

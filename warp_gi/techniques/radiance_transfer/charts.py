@@ -17,14 +17,15 @@ import numpy as np
 
 from warp_gi.errors import OptionError
 from warp_gi.techniques.radiance_transfer.chart_cache import WORKER, cached
+from warp_gi.techniques.radiance_transfer.islands import equal_rows, islands
 
 Progress = Callable[[float], None]
 """Called with the share of the work that is done."""
 
 TRIANGLE_SIZE = 64.0
 """Root of the mean area of a part's triangles as xatlas gets them: it drops those with an area below 1e-7."""
-MOST_FACES = 16384
-"""Faces of a part that xatlas cuts at once: its time and memory grow faster than their number."""
+MOST_FACES = 2048
+"""Faces of an island that xatlas cuts at once: its time and memory grow faster than their number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +141,7 @@ def cut_charts(
     """
     if len(points) == 0:
         return np.zeros((0, 3, 2), np.float32), np.zeros(0, np.int32)
-    parts = split_parts(points.mean(axis=1), parts)
+    parts = split_parts(points, parts)
     order = np.argsort(parts, kind="stable")
     points, parts = points[order], parts[order]
     starts = np.searchsorted(parts, np.arange(parts[-1] + 2))
@@ -150,7 +151,7 @@ def cut_charts(
         sides = points[begin:end, 1:] - points[begin:end, :1]
         size = np.sqrt(0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).mean())
         places = ((corners - corners.min(axis=0)) * (TRIANGLE_SIZE / size)).astype(np.float32)
-        vertices, indices = np.unique(places, axis=0, return_inverse=True)
+        vertices, indices = equal_rows(places)
         all_points.append(vertices)
         all_indices.append(indices.reshape(-1, 3).astype(np.uint32))
         vertex_starts.append(vertex_starts[-1] + len(vertices))
@@ -166,24 +167,38 @@ def cut_charts(
     return uvs, charts
 
 
-def split_parts(centers: np.ndarray, parts: np.ndarray) -> np.ndarray:
-    """Return parts of at most MOST_FACES faces, int32 [face], from 0 without a gap: halves of halves of larger ones.
+def split_parts(points: np.ndarray, parts: np.ndarray) -> np.ndarray:
+    """Return parts without a gap, int32 [face]: of those with more than MOST_FACES faces, pieces of about that many.
 
-    ``centers`` float64 [face, 3] and ``parts`` int32 [face] are those of the faces. A part is halved at the median of
-    its longest axis.
+    An island stays whole if it has no more; larger ones are halved at the median of their longest axis, and again.
+    ``points`` float64 [face, 3, 3] and ``parts`` int32 [face] are those of the faces.
     """
     result, number = np.empty(len(parts), np.int32), 0
     order = np.argsort(parts, kind="stable")
-    stack = np.split(order, np.flatnonzero(np.diff(parts[order])) + 1)[::-1]
-    while stack:
-        faces = stack.pop()
-        if len(faces) > MOST_FACES:
-            axis = int(np.argmax(np.ptp(centers[faces], axis=0)))
-            by_axis = faces[np.argsort(centers[faces, axis], kind="stable")]
-            stack += [by_axis[len(faces) // 2 :], by_axis[: len(faces) // 2]]
+    for faces in np.split(order, np.flatnonzero(np.diff(parts[order])) + 1):
+        if len(faces) <= MOST_FACES:
+            result[faces] = number
+            number += 1
             continue
-        result[faces] = number
-        number += 1
+        centers = points[faces].mean(axis=1)
+        island = islands(points[faces])
+        sizes = np.bincount(island)
+        small = np.where(sizes <= MOST_FACES, sizes, 0)
+        group = np.where(small > 0, (np.cumsum(small) - small) // MOST_FACES, -1)[island]
+        chosen = np.flatnonzero(group >= 0)
+        groups, group[chosen] = np.unique(group[chosen], return_inverse=True)
+        result[faces[chosen]] = number + group[chosen]
+        number += len(groups)
+        stack = [np.flatnonzero(island == large) for large in np.flatnonzero(small == 0)[::-1]]
+        while stack:
+            chosen = stack.pop()
+            if len(chosen) > MOST_FACES:
+                axis = int(np.argmax(np.ptp(centers[chosen], axis=0)))
+                by_axis = chosen[np.argsort(centers[chosen, axis], kind="stable")]
+                stack += [by_axis[len(chosen) // 2 :], by_axis[: len(chosen) // 2]]
+                continue
+            result[faces[chosen]] = number
+            number += 1
     return result
 
 

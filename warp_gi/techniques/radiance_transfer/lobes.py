@@ -28,7 +28,7 @@ SMALLEST_ALPHA = 1.0e-3  # as in kernels/bsdf.py
 _UP = np.array([0.0, 0.0, 1.0])
 _ANGLES = (-0.6 * math.pi, 0.2)  # between which a lobe's direction is sought, radians from the normal
 _STEPS = 192  # of that search
-_RINGS, _SPOKES = 32, 32  # visible normals by which a GGX lobe is integrated, on half of the sphere
+_RINGS, _SPOKES = 48, 24  # visible normals by which a GGX lobe is integrated, on half of the sphere
 # Costs that keep the fit from answering differently to neighbours, where different answers are nearly as good.
 _RIDGE = 3e-4  # of coefficients
 _NORMAL_RIDGE = 1e-3 * 0.2**-6  # of the part about the normal, times (1 - roughness)^6: it is for rough lobes
@@ -165,7 +165,7 @@ def ggx_directions(
     wo = np.concatenate([np.sqrt(1 - cos_o**2), 0 * cos_o, cos_o], axis=-1)
     stretched = wo * [alpha, alpha, 1.0]
     stretched /= np.linalg.norm(stretched, axis=-1, keepdims=True)
-    nodes, weights = np.polynomial.legendre.leggauss(rings)
+    nodes, weights = _gauss(rings)
     span = np.arccos(-stretched[:, 2:])  # a spherical cap of half vectors (Dupuy and Benyoub 2023)
     polar = span * (nodes + 1) / 2
     share = np.sin(polar) * weights * span / 2 / (1 + stretched[:, 2:])
@@ -180,6 +180,11 @@ def ggx_directions(
     root_o, root_i = (np.sqrt(alpha**2 + (1 - alpha**2) * c**2) for c in (cos_o, cos_i))
     value = cos_i * (cos_o + root_o) / (cos_o * root_i + cos_i * root_o)  # f cos / pdf
     return wi, np.repeat(share, spokes, axis=-1) / spokes * value, (1 - np.clip(cos_h, 0, 1)) ** 5
+
+
+@cache
+def _gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.polynomial.legendre.leggauss(count)
 
 
 def _ggx_moments(roughness: float, cosines: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

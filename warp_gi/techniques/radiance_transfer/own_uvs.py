@@ -14,8 +14,8 @@ LEAST_RASTER, MOST_RASTER = 128, 1024
 """Texels along a side of the picture in which overlaps are counted: 16 times the root of the number of triangles."""
 MARGIN = 1e-4
 """Barycentric coordinate from which on a texel's centre lies within a triangle: neighbours share those at 0."""
-BATCH = 1 << 21
-"""Texels in boxes of triangles that are looked at together."""
+FIRST_BATCH, MOST_BATCH = 1 << 14, 1 << 20
+"""Texels in boxes of triangles that are looked at together: few at first, as most uv that overlap do so at once."""
 
 
 def why_unfit(uvs: np.ndarray | None, areas: np.ndarray) -> str | None:
@@ -62,9 +62,9 @@ def overlap(uvs: np.ndarray) -> tuple[float, bool]:
     counts = size.prod(axis=1)
     ends = np.cumsum(counts)
     covers = np.zeros(width * height, np.uint8)
-    begin = 0
+    begin, batch = 0, FIRST_BATCH
     while begin < len(uvs):
-        end = max(int(np.searchsorted(ends, ends[begin] - counts[begin] + BATCH, side="right")), begin + 1)
+        end = max(int(np.searchsorted(ends, ends[begin] - counts[begin] + batch, side="right")), begin + 1)
         chosen = np.repeat(np.arange(begin, end), counts[begin:end])
         rank = np.arange(len(chosen)) - np.repeat(
             ends[begin:end] - counts[begin:end] - ends[begin] + counts[begin], counts[begin:end]
@@ -73,7 +73,7 @@ def overlap(uvs: np.ndarray) -> tuple[float, bool]:
         inside = _is_inside(corners[chosen], np.stack([x, y], axis=1) + 0.5)
         found = np.bincount((y * width + x)[inside], minlength=len(covers))
         covers = np.minimum(covers + np.minimum(found, 2), 2).astype(np.uint8)
-        begin = end
+        begin, batch = end, min(2 * batch, MOST_BATCH)
         if np.count_nonzero(covers == 2) > MOST_OVERLAP * len(covers):
             break
     covered = np.count_nonzero(covers)
@@ -93,22 +93,3 @@ def _is_inside(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     total = parts.sum(axis=0)
     shares = np.divide(parts, total, out=np.zeros_like(parts), where=total != 0.0)
     return (shares > MARGIN).all(axis=0)
-
-
-def islands(points: np.ndarray, uvs: np.ndarray) -> np.ndarray:
-    """Return the island of each face, int32 [face]: faces hang together where corners agree in place and in uv.
-
-    ``points`` [face, 3, n] and ``uvs`` [face, 3, 2] are corners; places may have more coordinates than three.
-    """
-    keys = np.concatenate([points.reshape(3 * len(points), -1), uvs.reshape(-1, 2)], axis=1).astype(np.float32)
-    corners = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1, 3)
-    labels = np.arange(corners.max(initial=-1) + 1)  # of corners: the lowest corner that each hangs together with
-    while True:
-        lowest = labels[corners].min(axis=1)
-        after = labels.copy()
-        np.minimum.at(after, labels[corners].reshape(-1), np.repeat(lowest, 3))
-        np.minimum.at(after, corners.reshape(-1), np.repeat(lowest, 3))
-        after = after[after]
-        if np.array_equal(after, labels):
-            return np.unique(labels[corners[:, 0]], return_inverse=True)[1].astype(np.int32)
-        labels = after

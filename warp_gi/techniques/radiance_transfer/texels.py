@@ -71,8 +71,8 @@ def _binned(
     page = face_pages[faces]
     box = corners[faces].astype(np.float64)
     last = np.stack([columns, rows], axis=1)[page] - 1
-    low = np.clip(np.floor(box.min(axis=1) - 1.5).astype(np.int64) // TILE, 0, last)
-    high = np.clip(np.ceil(box.max(axis=1) + 0.5).astype(np.int64) // TILE, 0, last)
+    low = np.clip(np.floor(box.min(axis=1) - 0.5).astype(np.int64) // TILE, 0, last)
+    high = np.clip(np.floor(box.max(axis=1) + 0.5).astype(np.int64) // TILE, 0, last)
     size = high - low + 1
     counts = size.prod(axis=1)
     which = np.repeat(np.arange(len(faces)), counts)
