@@ -13,11 +13,15 @@ from warp_gi.kernels.path_samplers import KnownRadiance, PathCache
 from warp_gi.kernels.sampling import circle, frame_of
 from warp_gi.kernels.surface import Surface, ray_origin, shading_normal
 from warp_gi.kernels.transfer_atlas import SlotFetch, TransferAtlas, atlas_fetch, side_seen
-from warp_gi.kernels.transfer_lobes import LobeTable, lobe_at
+from warp_gi.kernels.transfer_lobes import LobeTable, PrefilteredSky, lobe_at, table_place, unshaded_radiance
 from warp_gi.kernels.transfer_products import bounced_product, environment_product, glossy_product
 from warp_gi.kernels.types import Environment, SceneData
 
 wp.set_module_options({"enable_backward": False})
+
+MEAN_OF_FIRST = wp.constant(wp.float32(0.2820948))  # a sky's mean over its first coefficient
+LEAST_OF_MEAN = wp.constant(wp.float32(0.05))  # what the light of an open lobe counts as at least, in means of the sky
+MOST_SHARE = wp.constant(wp.float32(1.5))  # of the light of an open lobe
 
 
 # What a bake holds, and where it is kept. Rows are padded (transfer_products.py).
@@ -37,6 +41,8 @@ class TransferSky:
     whole_light: wp.array(dtype=wp.float32)  # [3, 32] with suns: light over other surfaces
     matrix: wp.array(dtype=wp.float32)  # [order^2, 3, width] of light without suns: sum_i C_ijk L_i, for lobes
     lobes: LobeTable
+    prefiltered: PrefilteredSky  # without suns
+    scale: wp.float32  # of its radiance
     rest: Environment  # the sky without suns, for rays of sharp lobes
     sun_count: wp.int32
     sun_directions: wp.array(dtype=wp.vec3)
@@ -87,16 +93,36 @@ def diffuse_radiance(rows: TransferRows, sky: TransferSky, s: Surface, at: SlotF
     return wp.cw_mul(wp.cw_mul(diffuse_share(s.bsdf), s.bsdf.diffuse), irradiance) / wp.pi
 
 
-# Radiance of the sky, without suns, that the glossy lobe reflects towards the unit direction `view`.
+# Radiance of the sky, without suns, that the glossy lobe reflects towards the unit direction `view`: by transfer alone,
+# or (`ratio`) of the prefiltered sky the share that transfer says the occluders let through. The sky of 25 numbers may
+# come near 0 or below it where the real one does not, so that share is bounded, and so is what it divides by.
 @wp.func
-def glossy_radiance(rows: TransferRows, sky: TransferSky, s: Surface, at: SlotFetch, view: wp.vec3) -> wp.vec3:
+def glossy_radiance(
+    rows: TransferRows, sky: TransferSky, ratio: wp.int32, s: Surface, at: SlotFetch, view: wp.vec3
+) -> wp.vec3:
     normal = shading_normal(s)
-    lobe = lobe_at(sky.lobes, wp.sqrt(s.bsdf.alpha), normal, view)
-    light = glossy_product(
-        rows.transfer, rows.width, at.slots, at.shares, sky.matrix, lobe.direction, lobe.factors, normal
+    place = table_place(sky.lobes, wp.sqrt(s.bsdf.alpha), wp.dot(normal, view))
+    lobe = lobe_at(sky.lobes, place, normal, view)
+    products = glossy_product(
+        rows.transfer,
+        rows.width,
+        at.slots,
+        at.shares,
+        sky.matrix,
+        lobe.direction,
+        lobe.factors,
+        normal,
+        lobe.normal_factors,
     )
+    light = wp.vec3(products[0], products[1], products[2])
+    if ratio != 0:
+        open = unshaded_radiance(sky.lobes, sky.prefiltered, sky.rest.environment_from_world, place, normal, view)
+        for c in range(3):
+            least = LEAST_OF_MEAN * MEAN_OF_FIRST * sky.light[c * rows.width]
+            share = wp.clamp(light[c] / wp.max(products[3 + c], wp.max(least, 1.0e-20)), 0.0, MOST_SHARE)
+            light[c] = open[c] * sky.scale * share
     reflected = s.bsdf.f0 * lobe.scale + wp.vec3(1.0, 1.0, 1.0) * (s.bsdf.f90 * lobe.offset)
-    return wp.cw_mul(reflected, wp.vec3(light[0], light[1], light[2]))
+    return wp.cw_mul(reflected, light)
 
 
 # Whether transfer is kept around a point.

@@ -1,64 +1,141 @@
-"""Zonal lobes that stand for GGX in spherical harmonics, from a table by roughness and view angle.
+"""Lobes that stand for GGX in spherical harmonics, from a table by roughness and view angle, and the sky through them.
 
-The table is fitted on the host (techniques/radiance_transfer/lobes.py).
+Tables are fitted on the host (techniques/radiance_transfer/lobes.py and prefiltered.py).
 """
 
 import warp as wp
 
+from warp_gi.kernels.environment import lat_long_encode
 from warp_gi.kernels.transfer_products import vec6
 
 wp.set_module_options({"enable_backward": False})
 
 HEAD = wp.constant(4)  # numbers of an entry before its factors
+NORMAL_BANDS = wp.constant(4)  # factors about the normal, at its end
 
 
 @wp.struct
 class LobeTable:
-    entries: wp.array3d(dtype=wp.float32)  # [roughness, cosine, 4 + order]: sine, cosine, A, B, factors
+    entries: wp.array3d(dtype=wp.float32)  # [roughness, column, 8 + order]: sine, cosine, A, B, factors
     smallest: wp.float32  # roughness of the first row; the last is 1
+    lookups: wp.array3d(dtype=wp.float32)  # [roughness, column, 3]: sine, cosine and level of a map of the sky
 
 
-# A lobe about a direction in the plane of normal and view. It reflects f0 A + f90 B of light from everywhere, times
-# what its factors, of albedo 1, reflect of the light that there is.
+# Maps of the sky, prefiltered by roughness, in its own space.
+@wp.struct
+class PrefilteredSky:
+    texels: wp.array(dtype=wp.vec3)  # [level, row, column]
+    levels: wp.int32
+    rows: wp.int32  # of a map, which has twice as many columns
+
+
+# Place between four entries of a table: the upper left one, and shares of rows and columns behind it.
+@wp.struct
+class TablePlace:
+    row: wp.int32
+    column: wp.int32
+    down: wp.float32
+    right: wp.float32
+
+
+# A lobe in the plane of normal and view. It reflects f0 A + f90 B of light from everywhere, times what its factors, of
+# albedo 1, reflect of the light that there is.
 @wp.struct
 class Lobe:
     direction: wp.vec3  # world space, unit
     scale: wp.float32  # A
     offset: wp.float32  # B
-    factors: vec6
+    factors: vec6  # about the direction
+    normal_factors: wp.vec4  # about the normal, of bands 1 to 4
 
 
-# The lobe of a roughness about the unit normal n, seen from the unit direction `view`; cosines and roughness between
-# entries are interpolated.
 @wp.func
-def lobe_at(table: LobeTable, roughness: wp.float32, n: wp.vec3, view: wp.vec3) -> Lobe:
-    last = table.entries.shape[0] - 1
+def table_place(table: LobeTable, roughness: wp.float32, cosine: wp.float32) -> TablePlace:
+    rows = table.entries.shape[0] - 1
     columns = table.entries.shape[1] - 1
-    cosine = wp.clamp(wp.dot(n, view), 0.0, 1.0)
-    x = wp.clamp((roughness - table.smallest) / (1.0 - table.smallest), 0.0, 1.0) * wp.float32(last)
-    y = cosine * wp.float32(columns)
-    i = wp.min(wp.int32(x), last - 1)
-    j = wp.min(wp.int32(y), columns - 1)
-    fx = x - wp.float32(i)
-    fy = y - wp.float32(j)
-    w00 = (1.0 - fx) * (1.0 - fy)
-    w10 = fx * (1.0 - fy)
-    w01 = (1.0 - fx) * fy
-    w11 = fx * fy
+    r = TablePlace()
+    x = wp.clamp((roughness - table.smallest) / (1.0 - table.smallest), 0.0, 1.0) * wp.float32(rows)
+    y = wp.sqrt(1.0 - wp.sqrt(wp.clamp(cosine, 0.0, 1.0))) * wp.float32(columns)
+    r.row = wp.min(wp.int32(x), rows - 1)
+    r.column = wp.min(wp.int32(y), columns - 1)
+    r.down = x - wp.float32(r.row)
+    r.right = y - wp.float32(r.column)
+    return r
+
+
+@wp.func
+def table_entry(table: wp.array3d(dtype=wp.float32), at: TablePlace, k: wp.int32) -> wp.float32:
+    above = wp.lerp(table[at.row, at.column, k], table[at.row, at.column + 1, k], at.right)
+    below = wp.lerp(table[at.row + 1, at.column, k], table[at.row + 1, at.column + 1, k], at.right)
+    return wp.lerp(above, below, at.down)
+
+
+# Unit direction of a sine and a cosine in the plane of normal and view; the sine is 0 where they are one.
+@wp.func
+def in_plane(n: wp.vec3, view: wp.vec3, sine: wp.float32, cosine: wp.float32) -> wp.vec3:
+    across = view - n * wp.dot(n, view)
+    length = wp.length(across)
+    return wp.normalize(across * (sine / wp.max(length, 1.0e-6)) + n * cosine)
+
+
+# The lobe about the unit normal n, seen from the unit direction `view`. What its factors reflect without occluders,
+# sum_l A_l (2 l + 1) / (4 pi) (about d P_l(c) + about n), is made 1: entries between those of the table do not add up.
+@wp.func
+def lobe_at(table: LobeTable, at: TablePlace, n: wp.vec3, view: wp.vec3) -> Lobe:
     r = Lobe()
     e = table.entries
-    sine = e[i, j, 0] * w00 + e[i + 1, j, 0] * w10 + e[i, j + 1, 0] * w01 + e[i + 1, j + 1, 0] * w11
-    cos_d = e[i, j, 1] * w00 + e[i + 1, j, 1] * w10 + e[i, j + 1, 1] * w01 + e[i + 1, j + 1, 1] * w11
-    r.scale = e[i, j, 2] * w00 + e[i + 1, j, 2] * w10 + e[i, j + 1, 2] * w01 + e[i + 1, j + 1, 2] * w11
-    r.offset = e[i, j, 3] * w00 + e[i + 1, j, 3] * w10 + e[i, j + 1, 3] * w01 + e[i + 1, j + 1, 3] * w11
-    for l in range(table.entries.shape[2] - HEAD):
-        k = HEAD + l
-        r.factors[l] = e[i, j, k] * w00 + e[i + 1, j, k] * w10 + e[i, j + 1, k] * w01 + e[i + 1, j + 1, k] * w11
-    tangent = view - n * wp.dot(n, view)
-    length = wp.length(tangent)
-    if length > 1.0e-6:
-        tangent = tangent / length
-    else:  # seen along the normal; the sine is 0 there
-        tangent = wp.vec3(0.0, 0.0, 0.0)
-    r.direction = wp.normalize(tangent * sine + n * cos_d)
+    order = e.shape[2] - HEAD - NORMAL_BANDS
+    side = wp.vec2(table_entry(e, at, 0), table_entry(e, at, 1))
+    side = side / wp.length(side)
+    r.direction = in_plane(n, view, side[0], side[1])
+    r.scale = table_entry(e, at, 2)
+    r.offset = table_entry(e, at, 3)
+    for l in range(order):
+        r.factors[l] = table_entry(e, at, HEAD + l)
+    for l in range(NORMAL_BANDS):
+        r.normal_factors[l] = table_entry(e, at, HEAD + order + l)
+    c = side[1]
+    c2 = c * c
+    f = r.factors
+    m = r.normal_factors
+    white = 0.25 * f[0] + 0.5 * (f[1] * c + m[0]) + 0.3125 * (f[2] * (1.5 * c2 - 0.5) + m[1])
+    white = white - 0.09375 * (f[4] * ((4.375 * c2 - 3.75) * c2 + 0.375) + m[3])
+    r.factors = f / white
+    r.normal_factors = m / white
     return r
+
+
+# Radiance of the sky through the lobe of GGX, without occluders, for an albedo of 1.
+@wp.func
+def unshaded_radiance(
+    table: LobeTable,
+    sky: PrefilteredSky,
+    environment_from_world: wp.mat33,
+    at: TablePlace,
+    n: wp.vec3,
+    view: wp.vec3,
+) -> wp.vec3:
+    direction = in_plane(n, view, table_entry(table.lookups, at, 0), table_entry(table.lookups, at, 1))
+    uv = lat_long_encode(environment_from_world * direction)
+    level = wp.clamp(table_entry(table.lookups, at, 2), 0.0, wp.float32(sky.levels - 1))
+    k = wp.min(wp.int32(level), sky.levels - 2)
+    share = level - wp.float32(k)
+    return map_radiance(sky, k, uv) * (1.0 - share) + map_radiance(sky, k + 1, uv) * share
+
+
+# Bilinear lookup in one map, whose nodes lie as those of an environment's.
+@wp.func
+def map_radiance(sky: PrefilteredSky, level: wp.int32, uv: wp.vec2) -> wp.vec3:
+    columns = 2 * sky.rows
+    x = uv[0] * wp.float32(columns) - 0.5
+    y = wp.clamp(uv[1], 0.0, 1.0) * wp.float32(sky.rows - 1)
+    left = wp.int32(wp.floor(x))
+    row = wp.min(wp.int32(y), sky.rows - 2)
+    s = x - wp.float32(left)
+    t = y - wp.float32(row)
+    right = (left + 1) % columns
+    left = (left + columns) % columns
+    start = (level * sky.rows + row) * columns
+    upper = sky.texels[start + left] * (1.0 - s) + sky.texels[start + right] * s
+    lower = sky.texels[start + columns + left] * (1.0 - s) + sky.texels[start + columns + right] * s
+    return upper * (1.0 - t) + lower * t

@@ -131,8 +131,8 @@ _BOUNCED = (
 """
 )
 
-# A lobe, of factors lobe[l] about a direction, times the light's matrix, and that times T, blended: the triple product
-# with fixed light. W_cj = sum_k M_ckj F_k comes first, so that the same W serves T and the transfer of a point that
+# A lobe, of factors lobe[l] about a direction and normal_lobe[l - 1] about the normal, times the light's matrix, and
+# that times T, blended: the triple product with fixed light. W_cj = sum_k M_ckj F_k comes first, so that the same W serves T and the transfer of a point that
 # nothing shades, lobe by lobe A_l y(n): results 0 to 2, and 3 to 5.
 _GLOSSY = (
     "    wp::vec_t<6, float> result;\n"
@@ -141,8 +141,8 @@ _GLOSSY = (
     auto run = [&](auto tag) {
         enum { N = decltype(tag)::N, COUNT = decltype(tag)::N == 4 ? 25 : 36 };
         const int order = N == 4 ? 5 : 6;
-        float y[40] = {};
-        auto functions = [&](wp::vec3 d) {
+        float about[40] = {}, up[40] = {};
+        auto functions = [&](wp::vec3 d, float* y) {
             const float x = d[0], y_ = d[1], z = d[2];
             if (N == 4) {
         ORDER_FIVE
@@ -150,13 +150,14 @@ _GLOSSY = (
         ORDER_SIX
             }
         };
-        functions(direction);
+        functions(direction, about);
+        functions(normal, up);
         Eight product[3][N];
         for (int c = 0; c < 3; ++c) for (int v = 0; v < N; ++v) product[c][v] = Eight{};
         int k = 0;
         for (int l = 0; l < order; ++l) {
             for (int m = 0; m < 2 * l + 1; ++m, ++k) {
-                const float factor = lobe[l] * y[k];
+                const float factor = lobe[l] * about[k] + (l > 0 && l < 5 ? normal_lobe[l - 1] * up[k] : 0.0f);
                 const float* rows = matrix.data + k * (24 * N);
                 for (int c = 0; c < 3; ++c)
                     for (int v = 0; v < N; ++v) product[c][v] += load(rows + (c * N + v) * 8) * factor;
@@ -169,14 +170,13 @@ _GLOSSY = (
             const wp::half* row = transfer.data + (size_t)slots[k] * (8 * N);
             for (int v = 0; v < N; ++v) sum[v] += row_part(row + 8 * v) * shares[k];
         }
-        functions(normal);
         const float cosine[6] = {COSINE};
-        for (int l = 0, i = 0; l < order; ++l) for (int m = 0; m < 2 * l + 1; ++m, ++i) y[i] *= cosine[l];
+        for (int l = 0, i = 0; l < order; ++l) for (int m = 0; m < 2 * l + 1; ++m, ++i) up[i] *= cosine[l];
         for (int c = 0; c < 3; ++c) {
             Eight shaded = Eight{}, open = Eight{};
             for (int v = 0; v < N; ++v) {
                 shaded += product[c][v] * sum[v];
-                open += product[c][v] * load(y + 8 * v);
+                open += product[c][v] * load(up + 8 * v);
             }
             result[c] = total(shaded);
             result[3 + c] = total(open);
@@ -185,8 +185,8 @@ _GLOSSY = (
     if (width == 32) run(Four()); else run(Five());
 #else
     const int order = width == 32 ? 5 : 6;
-    float y[40] = {}, open[40] = {}, sum[40] = {};
-    auto functions = [&](wp::vec3 d) {
+    float about[40] = {}, up[40] = {}, sum[40] = {};
+    auto functions = [&](wp::vec3 d, float* y) {
         const float x = d[0], y_ = d[1], z = d[2];
         if (order == 5) {
         ORDER_FIVE
@@ -195,9 +195,8 @@ _GLOSSY = (
         }
     };
     const float cosine[6] = {COSINE};
-    functions(normal);
-    for (int l = 0, i = 0; l < order; ++l) for (int m = 0; m < 2 * l + 1; ++m, ++i) open[i] = y[i] * cosine[l];
-    functions(direction);
+    functions(normal, up);
+    functions(direction, about);
     for (int k = 0; k < 4; ++k) {
         if (shares[k] == 0.0f) continue;
         const wp::half* row = transfer.data + (size_t)slots[k] * width;
@@ -205,12 +204,14 @@ _GLOSSY = (
     }
     for (int l = 0, k = 0; l < order; ++l) {
         for (int m = 0; m < 2 * l + 1; ++m, ++k) {
-            const float factor = lobe[l] * y[k];
+            const float factor = lobe[l] * about[k] + (l > 0 && l < 5 ? normal_lobe[l - 1] * up[k] : 0.0f);
             for (int c = 0; c < 3; ++c) {
                 const float* row = matrix.data + (k * 3 + c) * width;
-                for (int i = 0; i < order * order; ++i) {
-                    result[c] += factor * row[i] * sum[i];
-                    result[3 + c] += factor * row[i] * open[i];
+                for (int band = 0, i = 0; band < order; ++band) {
+                    for (int n = 0; n < 2 * band + 1; ++n, ++i) {
+                        result[c] += factor * row[i] * sum[i];
+                        result[3 + c] += factor * row[i] * cosine[band] * up[i];
+                    }
                 }
             }
         }
@@ -262,8 +263,8 @@ def bounced_product(
 ) -> wp.vec3: ...
 
 
-# Light that a zonal lobe about a direction reflects: with transfer, and as if nothing shaded the point. `matrix` is
-# [k, channel, width].
+# Light that a lobe reflects which is zonal about a direction and about the normal: with transfer, and as if nothing
+# shaded the point. `matrix` is [k, channel, width].
 @wp.func_native(snippet=_filled(_GLOSSY))
 def glossy_product(
     transfer: wp.array(dtype=wp.float16),
@@ -274,4 +275,5 @@ def glossy_product(
     direction: wp.vec3,
     lobe: vec6,
     normal: wp.vec3,
+    normal_lobe: wp.vec4,
 ) -> vec6: ...

@@ -31,6 +31,7 @@ SUN_DIMENSION = wp.constant(OWN_DIMENSION + 1)  # by camera sample
 class TransferQuery:
     terms: wp.int32  # WANTS_*
     traced_below: wp.float32  # roughness below which rays are traced for the glossy lobe
+    ratio: wp.int32  # 1: glossy light of the prefiltered sky, shaded by transfer; 0: by transfer alone
     soft: wp.int32  # 1: suns are discs, by one point of each a camera sample; 0: their middles
     traces: wp.int32  # 1: a launch of transfer_trace.py serves these pixels, and those where no transfer is kept
 
@@ -108,7 +109,7 @@ def shade_transfer(
     if (query.terms & WANTS_ENVIRONMENT) != 0:
         light = diffuse_radiance(rows, sky, s, at)
         if s.bsdf.f90 > 0.0:
-            light = light + glossy_radiance(rows, sky, s, at, -direction)
+            light = light + glossy_radiance(rows, sky, query.ratio, s, at, -direction)
         light = wp.max(light, wp.vec3(0.0, 0.0, 0.0))
         if sky.sun_count > 0:
             u = sun_point(settings, p, query.soft)

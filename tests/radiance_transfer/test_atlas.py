@@ -1,6 +1,7 @@
 """Atlases of transfer textures: what a bilinear fetch finds, which backs have slots, and what is kept on disk."""
 
 import dataclasses
+import subprocess
 import warnings
 
 import numpy as np
@@ -20,7 +21,7 @@ from scene_tools import GREY, quad, sphere
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.techniques.radiance_transfer import chart_cache, chart_worker, charts
+from warp_gi.techniques.radiance_transfer import chart_cache, chart_job, chart_worker, charts
 from warp_gi.techniques.radiance_transfer.atlas import make_atlas
 from warp_gi.techniques.radiance_transfer.densities import automatic_factors, density_factors, parse_texel_sets
 from warp_gi.techniques.radiance_transfer.islands import islands
@@ -365,8 +366,34 @@ def test_time_limit(monkeypatch):
 
 def test_a_worker_that_fails(monkeypatch):
     monkeypatch.setattr(charts.ChartJob, "run", RUN)
-    with pytest.raises(gi.OptionError, match=r"making charts by xatlas failed \(.+\); take charts='own'"):
+    with pytest.raises(gi.OptionError, match=r"making charts by xatlas failed \(.+\); take the meshes' own uv"):
         charts.ChartJob(0.0).run({"size": np.array(3)})
+
+
+def test_time_limit_by_the_clock(monkeypatch):
+    """Where the system counts no CPU time, as on Windows, the worker is ended by the clock."""
+    monkeypatch.delattr(chart_job.signal, "setitimer")
+    monkeypatch.setattr(charts.ChartJob, "run", RUN)
+    with pytest.raises(gi.OptionError, match=r"longer than chart_seconds=0\.05"):
+        make_atlas(scene_of(ball(rings=90)), settings(chart_seconds=0.05), "cpu")
+
+
+def test_an_interrupt_ends_the_worker(monkeypatch):
+    monkeypatch.setattr(charts.ChartJob, "run", RUN)
+    processes = []
+
+    class Listed(subprocess.Popen):
+        def __init__(self, *arguments, **options):
+            super().__init__(*arguments, **options)
+            processes.append(self)
+
+    def interrupt(share):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(chart_job.subprocess, "Popen", Listed)
+    with pytest.raises(KeyboardInterrupt):
+        make_atlas(scene_of(ball(rings=6), FLOOR), settings(), "cpu", interrupt)
+    assert [process.poll() is not None for process in processes] == [True]
 
 
 def test_limits_are_shared_by_the_jobs_of_an_atlas(monkeypatch):

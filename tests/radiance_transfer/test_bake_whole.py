@@ -11,9 +11,12 @@ from transfer_tools import open_transfer, transfer_settings
 
 import warp_gi as gi
 from warp_gi import launch
+from warp_gi.bench.harness.scenes import LIVING_ROOM, SCENES
 from warp_gi.errors import BakeError, SceneError
+from warp_gi.techniques.radiance_transfer.atlas import make_atlas
 from warp_gi.techniques.radiance_transfer.bake import bake_transfer, regather, transfer_key
 from warp_gi.techniques.radiance_transfer.bounces import lamps_move
+from warp_gi.techniques.radiance_transfer.rays import trace_slots, transfer_work
 from warp_gi.techniques.radiance_transfer.textures import transfer_textures
 from warp_gi.techniques.radiance_transfer.vertices import vertex_atlas
 
@@ -163,8 +166,26 @@ def test_degenerate_and_moving_faces_have_no_vertices():
     atlas = vertex_atlas(gi.Scene([moving, gi.Node("floor", [extra])]))
     assert (atlas.corner_slots[:, :4] == -1).all() and (atlas.corner_slots[:, 4:] >= 0).all()
     line = gi.Scene([gi.Node("line", [replace(mesh, indices=np.int32([[0, 0, 1]]))])])
-    with pytest.raises(SceneError, match="no surface in this scene rests and has an area"):
-        vertex_atlas(line)
+    assert vertex_atlas(line).count == 0
+    for storage in ("texture", "vertices"):
+        with pytest.raises(SceneError, match="no surface in this scene rests and has an area; nothing can be baked"):
+            bake_transfer(line, transfer_settings(storage=storage), "cpu")
+
+
+@pytest.mark.parametrize("storage", ["texture", "vertices"])
+@pytest.mark.parametrize("scale", [1.0, 1e-6, 1e6])
+def test_faces_that_lie_on_each_other(storage, scale):
+    """A square three times, once turned over, of any size: both sides are in the open."""
+    card = quad((0, 0, 0), (0, 0, scale), (scale, 0, 0))
+    thrice = replace(card, indices=np.concatenate([card.indices, card.indices[:, ::-1], card.indices]))
+    textures = transfer_textures(
+        bake_transfer(gi.Scene([gi.Node("card", [thrice])]), transfer_settings(storage=storage), "cpu")
+    )
+    up = ((textures.atlas.slot_faces // 2) % 2 == 0) == (textures.atlas.slot_sides == 0)
+    assert up.any() and (~up).any()
+    for is_up, normal in ((up, (0, 1, 0)), (~up, (0, -1, 0))):
+        assert np.abs(textures.transfer[is_up] - open_transfer(normal)).max() < 2e-3
+    assert not textures.bounces.any()
 
 
 def test_key_depends_on_what_is_baked(scene):
@@ -235,3 +256,55 @@ def test_lamps_without_reflection_reach_nothing():
     result = transfer_textures(bake_transfer(dark, transfer_settings(), "cpu"))
     on_floor = result.atlas.slot_faces < 32
     assert not result.lamps[on_floor].any() and result.lamps[~on_floor & (result.atlas.slot_sides == 0)].mean() > 0.01
+
+
+@pytest.mark.parametrize("source", ["sky", "point", "surface"])
+def test_light_of_the_floor_is_that_of_the_path_tracer(source):
+    lamp = gi.Material("lamp", (0, 0, 0), specular=0.0, emission=(3.0, 2.0, 1.0))
+    lights = [gi.PunctualLight("point", (2.0, 4.0, 8.0), (1.0, 1.0, 1.0))] if source == "point" else []
+    parts = [gi.Node("lamp", [quad((0.5, 1.5, 0.5), (1, 0, 0), (0, 0, 1), lamp)])] if source == "surface" else []
+    scene = gi.Scene([*court().nodes, *parts], lights, 1.0 if source == "sky" else None)
+    textures = transfer_textures(bake_transfer(scene, transfer_settings(resolution=256, tolerance=1e-4), "cpu"))
+    camera = gi.Camera.look_at((0.4, 3.0, 1.0), (0.3, 0.0, 1.0), hfov=2.0, resolution=(8, 8))
+    frame = next(gi.render(scene, camera, gi.Pipeline(spp=512)))
+    atlas, geometry = textures.atlas, scene.data("cpu").geometry
+    corners = geometry.points.numpy()[geometry.indices.numpy()][atlas.slot_faces]
+    weights = np.column_stack([1 - atlas.slot_points.sum(axis=1), atlas.slot_points])
+    away = np.einsum("sc,scx->sx", weights, corners) - (0.3, 0, 1)
+    near = (atlas.slot_faces < 32) & (atlas.slot_sides == 0) & (np.linalg.norm(away, axis=1) < 0.06)
+    white = np.sqrt(4 * np.pi)
+    bounced = textures.bounces[near, :, 0].mean(axis=0, dtype=float) * white * (source == "sky")
+    direct = textures.transfer[near, 0].mean(dtype=float) * white * (source == "sky")
+    if source != "sky":
+        bounced = bounced + textures.lamps[near].mean(axis=0)
+    for term, irradiance in (("indirect", bounced), ("environment", direct)):
+        expected = frame.numpy(term).reshape(-1, 3).mean(axis=0)
+        assert irradiance / np.pi == pytest.approx(expected, rel=0.02), term
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name, most_rays", [(LIVING_ROOM, 150), ("crytek_sponza.glb", 150), ("modern_hall.glb", 300)])
+def test_error_of_real_scenes(name, most_rays):
+    """Error of T over slots, relative to its size, against 8192 rays."""
+    if not (SCENES / name).exists():
+        pytest.skip(f"no {SCENES / name}")
+    scene, device = gi.load_scene(SCENES / name), launch.get_device("cpu")
+    atlas = make_atlas(scene, transfer_settings(resolution=1024), "cpu")
+    some = np.sort(np.random.default_rng(0).choice(atlas.count, 4000, replace=False))
+    atlas = replace(
+        atlas, **{field: getattr(atlas, field)[some] for field in ("slot_faces", "slot_points", "slot_sides")}
+    )
+
+    def traced(seed, **rays):
+        return trace_slots(transfer_work(scene, atlas, transfer_settings(bounces=0, **rays), device, seed))
+
+    many = [traced(seed, first_rays=4096, rays=4096).transfer.astype(np.float64) for seed in (11, 12)]
+    reference = np.mean(many, axis=0)
+
+    def error(result):
+        return np.sqrt(((result.transfer - reference) ** 2).sum() / (reference**2).sum())
+
+    adaptive = traced(0)
+    assert error(traced(0, first_rays=256, rays=256)) < 0.028
+    assert error(adaptive) < 0.024 and adaptive.rays.mean() < most_rays
+    assert error(traced(0, first_rays=128)) < 0.019

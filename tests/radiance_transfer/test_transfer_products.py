@@ -45,7 +45,7 @@ def products(
     out: wp.array2d(dtype=wp.float32),
 ):
     i = first + wp.tid()
-    at = i * 20
+    at = i * 24
     slots = wp.vec4i(0, 0, 0, 0)
     shares = wp.vec4(0.0, 0.0, 0.0, 0.0)
     lobe = vec6()
@@ -56,8 +56,9 @@ def products(
         lobe[k] = points[at + 8 + k]
     direction = wp.vec3(points[at + 14], points[at + 15], points[at + 16])
     normal = wp.vec3(points[at + 17], points[at + 18], points[at + 19])
+    normal_lobe = wp.vec4(points[at + 20], points[at + 21], points[at + 22], points[at + 23])
     a = environment_product(rows, width, slots, shares, light)
-    b = glossy_product(rows, width, slots, shares, matrix, direction, lobe, normal)
+    b = glossy_product(rows, width, slots, shares, matrix, direction, lobe, normal, normal_lobe)
     d = bounced_product(bounces, slots, shares, light)
     for c in range(3):
         out[i, c] = a[c]
@@ -82,9 +83,13 @@ def test_products_are_those_of_numpy(order):
     slots = rng.integers(0, SLOTS, (POINTS, 4))
     shares = rng.dirichlet(np.ones(4), POINTS)
     shares[::3, 2] = 0.0
-    lobe, vectors = rng.normal(size=(POINTS, 6)), rng.normal(size=(2, POINTS, 3))
+    lobe, normal_lobe, vectors = (
+        rng.normal(size=(POINTS, 6)),
+        rng.normal(size=(POINTS, 4)),
+        rng.normal(size=(2, POINTS, 3)),
+    )
     vectors /= np.linalg.norm(vectors, axis=-1, keepdims=True)
-    points = np.concatenate([slots, shares, lobe, *vectors], axis=1).astype(np.float32)
+    points = np.concatenate([slots, shares, lobe, *vectors, normal_lobe], axis=1).astype(np.float32)
     at = device()
     out = wp.zeros((POINTS, 12), dtype=wp.float32, device=at)
     arrays = [
@@ -104,7 +109,8 @@ def test_products_are_those_of_numpy(order):
         np.testing.assert_allclose(out.numpy()[:, 9:], over, rtol=1e-4, atol=1e-5)
     bands = np.repeat(np.arange(order), 2 * np.arange(order) + 1)
     y, y_normal = (basis(v, order) for v in vectors)
-    product = np.einsum("pk,kci->pci", lobe[:, bands] * y, matrix.astype(np.float64))
+    about_n = np.pad(normal_lobe, ((0, 0), (1, 1)))
+    product = np.einsum("pk,kci->pci", lobe[:, bands] * y + about_n[:, bands] * y_normal, matrix.astype(np.float64))
     shaded = np.einsum("pci,pi->pc", product[..., :count], blend[:, :count])
     unshaded = y_normal * np.array(transfer_products.clamped_cosine(order))[bands]
     np.testing.assert_allclose(out.numpy()[:, 3:6], shaded, rtol=1e-4, atol=1e-4)

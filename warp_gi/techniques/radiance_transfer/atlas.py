@@ -12,6 +12,7 @@ from warp_gi.launch import get_device
 from warp_gi.scene.model import Mesh
 from warp_gi.scene.scene import Scene
 from warp_gi.techniques.radiance_transfer.backs import open_charts
+from warp_gi.techniques.radiance_transfer.buried import off_edges
 from warp_gi.techniques.radiance_transfer.charts import ChartJob, Page, cut_charts, packed, surface_sized
 from warp_gi.techniques.radiance_transfer.densities import density_factors
 from warp_gi.techniques.radiance_transfer.islands import islands
@@ -126,6 +127,7 @@ def _with_slots(
     tell = progress or (lambda share: None)
     tell(COVERED_SHARE)
     has_back = open_charts(scene, covered, charts, device)[charts[covered.faces]]
+    points = off_edges(corners[covered.faces].astype(np.float64), covered.points.astype(np.float64))
     fronts, backs = len(covered.faces), int(np.count_nonzero(has_back))
     slots = np.full((2, int((pages[:, 1] * pages[:, 2]).sum())), -1, np.int32)
     slots[0, covered.texels] = np.arange(fronts, dtype=np.int32)
@@ -139,7 +141,7 @@ def _with_slots(
         slots=slots,
         corner_slots=np.zeros((0, 0, 3), np.int32),
         slot_faces=np.concatenate([covered.faces, covered.faces[has_back]]),
-        slot_points=np.concatenate([covered.points, covered.points[has_back]]),
+        slot_points=np.concatenate([points, points[has_back]]),
         slot_sides=np.repeat(np.array([0, 1], np.uint8), (fronts, backs)),
     )
 

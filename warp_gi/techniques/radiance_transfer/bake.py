@@ -24,6 +24,7 @@ from warp_gi.techniques.radiance_transfer.bounces import (
     lamps_move,
     slot_reflectance,
 )
+from warp_gi.techniques.radiance_transfer.buried import without_buried
 from warp_gi.techniques.radiance_transfer.rays import (
     Progress,
     TracedTransfer,
@@ -113,7 +114,7 @@ def bake_transfer(
         progress: Called with the share that is done.
         keep_hits: Whether to keep the hits for ``regather``, in 4 bytes a ray of bounces.
 
-    Raises OptionError where charts fail, SceneError where nothing in the scene rests.
+    Raises OptionError where charts fail, SceneError where no surface in the scene rests and has an area.
     """
     target = get_device(device)
     stages = _Stages(progress)
@@ -122,11 +123,15 @@ def bake_transfer(
         with stages.run("charts") as told:
             vertices = settings.storage == "vertices"
             atlas = vertex_atlas(scene) if vertices else make_atlas(scene, settings, device, told)
+        if atlas.count == 0:
+            raise SceneError("no surface in this scene rests and has an area; nothing can be baked")
         with stages.run("rays") as told:
             work = transfer_work(scene, atlas, settings, target, seed)
-            traced = trace_slots(work, told)
+            lamps = _lamps(work, scene, seed)
+            lit = None if lamps is None else lamps.any(axis=1)
+            traced = without_buried(atlas, trace_slots(work, told), lit)
         stages.counts |= {"slots": atlas.count, "rays": int(traced.rays.sum(dtype=np.int64))}
-        bake = _bounced(scene, work, atlas, traced, settings, seed, stages)
+        bake = _bounced(scene, work, atlas, traced, lamps, settings, stages)
     if keep_hits:
         bake.arrays |= {"hits": traced.hits, "hits_key": _hits_key(scene)}
     return bake
@@ -149,7 +154,8 @@ def regather(scene: Scene, settings: TransferSettings, bake: Bake, device: str, 
         traced = TracedTransfer(textures.transfer, bake.arrays["hits"], np.zeros(0, np.int32))
         work = transfer_work(scene, textures.atlas, settings, target, seed)
         stages.counts |= {name: bake.counts[name] for name in ("slots", "rays")}
-        result = _bounced(scene, work, textures.atlas, traced, settings, seed, stages)
+        lamps = _lamps(work, scene, seed)
+        result = _bounced(scene, work, textures.atlas, traced, lamps, settings, stages)
     result.arrays |= {name: bake.arrays[name] for name in ("hits", "hits_key")}
     return result
 
@@ -159,8 +165,8 @@ def _bounced(
     work: TransferWork,
     atlas: Atlas,
     traced: TracedTransfer,
+    direct: np.ndarray | None,
     settings: TransferSettings,
-    seed: int,
     stages: _Stages,
 ) -> Bake:
     """Return a bake with all bounces of what was traced."""
@@ -173,14 +179,20 @@ def _bounced(
             bounced = gather_bounces(work, traced, reflectance, settings, told)
             textures = replace(textures, bounces=bounced.transfer)
             stages.counts |= {"bounces": bounced.count, "last_share": bounced.share}
-            if scene.emitter_count > 0 and not lamps_move(scene):
-                direct = lamp_irradiance(work, scene, seed)
+            if direct is not None:
                 lamps = gather_light(work, traced, reflectance, direct, settings.bounces, settings.tolerance)
                 textures = replace(textures, lamps=np.sum(lamps, axis=0, dtype=np.float32) + np.zeros_like(direct))
                 stages.counts["lamp_bounces"] = len(lamps)
         stages.counts["black_share"] = float(np.count_nonzero(traced.hits == BLACK) / max(traced.hits.size, 1))
     key = transfer_key(scene, settings.bounces > 0)
     return Bake(TECHNIQUE, key, settings.stored(), textures.arrays(), stages.counts, scene.name)
+
+
+def _lamps(work: TransferWork, scene: Scene, seed: int) -> np.ndarray | None:
+    """Return the irradiance that comes straight from lamps, float32 [slots, 3]; None without, or where one moves."""
+    if scene.emitter_count == 0 or lamps_move(scene):
+        return None
+    return lamp_irradiance(work, scene, seed)
 
 
 def _hits_key(scene: Scene) -> np.ndarray:

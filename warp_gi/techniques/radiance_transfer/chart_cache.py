@@ -15,11 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from warp_gi.files import replacing
+from warp_gi.techniques.radiance_transfer.chart_job import WORKER
 
 FORMAT = "warp_gi charts 1"
-"""Changes with what a job's arrays mean."""
-WORKER = Path(__file__).with_name("chart_worker.py")
-"""The program that works off jobs; what another version of it made is made again."""
+"""Changes with what a job's arrays mean. Charts by another version of xatlas, or of the worker, are made again, too."""
 MOST_BYTES = 2 << 30
 """Bytes of all files, above which those not read for longest are removed."""
 

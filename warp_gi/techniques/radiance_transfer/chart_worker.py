@@ -1,8 +1,7 @@
 """The program that cuts meshes into charts and packs them by xatlas, in a process of its own that can be stopped.
 
 It is run by its path with a folder, and imports nothing of this package. It reads ``job.npz`` there, writes
-``result.npz``, and prints the share of its work that is done, a line each. Arrays are those of ``charts.cut`` and
-``charts.pack``.
+``result.npz``, and prints the share of its work that is done, a line each. ``run`` says what is in them.
 """
 
 from __future__ import annotations
@@ -17,8 +16,8 @@ import numpy as np
 import xatlas
 
 CUT_TEXELS = 4.0
-"""Texels a triangle, along a side, of the page on which xatlas lays out the charts of one part. Their size is that of
-``charts.metric`` afterwards."""
+"""Texels along a side, by the root of the triangles' number, of the page on which xatlas lays out the charts of a part.
+Their true size is found afterwards, by ``charts.surface_scales``."""
 PADDING = 1
 """Texels between charts, beyond those that a bilinear fetch touches. With none, charts share such texels now and then;
 with two, a room of 5,000 charts has a third fewer texels on its surfaces."""
@@ -102,7 +101,12 @@ def _welded(uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def run(job: Mapping[str, np.ndarray], tell: Callable[[float], None]) -> dict[str, np.ndarray]:
-    """Return what a job asks for: the charts of each part, or all charts on a page."""
+    """Return what a job asks for: all charts on a page where it has a ``size``, otherwise the charts of each part.
+
+    The one has the arguments of ``pack`` and what it returns. The other has ``points`` and ``indices`` of ``cut``, one
+    part after another, with the first triangle and vertex of each part and their number in ``starts`` and
+    ``vertex_starts``; its result are ``uvs`` and ``charts`` of all triangles.
+    """
     if "size" in job:
         return pack(job["uvs"], job["charts"], int(job["size"]), tell)
     starts, vertex_starts = job["starts"], job["vertex_starts"]

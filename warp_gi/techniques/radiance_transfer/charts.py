@@ -3,24 +3,14 @@
 from __future__ import annotations
 
 import itertools
-import os
-import signal
-import subprocess
-import sys
-import tempfile
-import threading
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from warp_gi.errors import OptionError
-from warp_gi.techniques.radiance_transfer.chart_cache import WORKER, cached
+from warp_gi.techniques.radiance_transfer.chart_cache import cached
+from warp_gi.techniques.radiance_transfer.chart_job import ChartJob, Progress
 from warp_gi.techniques.radiance_transfer.islands import equal_rows, islands
-
-Progress = Callable[[float], None]
-"""Called with the share of the work that is done."""
 
 TRIANGLE_SIZE = 64.0
 """Root of the mean area of a part's triangles as xatlas gets them: it drops those with an area below 1e-7."""
@@ -40,59 +30,6 @@ class Page:
     """Texels along x."""
     height: int
     """Texels along y."""
-
-
-class ChartJob:
-    """Runs ``chart_worker.py`` with what is left of a limit of CPU seconds; 0 is no limit."""
-
-    def __init__(self, seconds: float) -> None:
-        self.limit = seconds
-        self.used = 0.0
-        """CPU seconds that the worker has used so far."""
-
-    def run(self, job: dict[str, np.ndarray], progress: Progress | None = None) -> dict[str, np.ndarray]:
-        """Return the worker's result; raises OptionError when the limit is over."""
-        left = max(self.limit - self.used, 1e-3) if self.limit > 0.0 else 0.0
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-        with tempfile.TemporaryDirectory(prefix="warp_gi_charts_") as name:
-            folder = Path(name)
-            np.savez(folder / "job.npz", **job)  # type: ignore[arg-type]
-            command = [sys.executable, "-s", str(WORKER), name, repr(left)]
-            with subprocess.Popen(
-                command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-            ) as process:
-                complaints: list[str] = []
-                listener = threading.Thread(target=lambda: complaints.extend(process.stderr or ()), daemon=True)
-                listener.start()
-                timer = None
-                if left > 0.0 and not hasattr(signal, "setitimer"):  # no CPU time limits there: by the clock
-                    timer = threading.Timer(left, process.kill)
-                    timer.start()
-                try:
-                    for line in process.stdout or ():
-                        if progress is not None:
-                            progress(float(line))
-                    code = process.wait()
-                except BaseException:
-                    process.kill()
-                    raise
-                finally:
-                    if timer is not None:
-                        timer.cancel()
-                    listener.join()
-            if code == 0:
-                with np.load(folder / "result.npz") as result:
-                    arrays = dict(result)
-                self.used += float(arrays.pop("seconds"))
-                return arrays
-        ended_by_limit = left > 0.0 and (timer is not None or code == -getattr(signal, "SIGPROF", 0))
-        if ended_by_limit:
-            raise OptionError(
-                f"xatlas took longer than chart_seconds={self.limit:g} to make charts; give chart_seconds more or 0 (no"
-                ' limit), take the meshes\' own uv (charts="own"), or keep transfer at vertices (storage="vertices")'
-            )
-        reason = complaints[-1].strip() if complaints else f"exit code {code}"
-        raise OptionError(f"making charts by xatlas failed ({reason}); take charts='own' or storage='vertices'")
 
 
 def surface_scales(points: np.ndarray, uvs: np.ndarray, charts: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ TEXELS_A_TRIANGLE = 4.0
 """Texels that the mean triangle of a mesh is to have, where densities are chosen."""
 COVERED = 0.5
 """About the share of a page that surfaces cover."""
-MOST_FACTOR = 8.0
+MOST_FACTOR = 32.0
 """Largest factor by which a density is raised above that of the others."""
 LARGEST_SHARE = 0.25
 """Share of all texels that meshes of raised density may take, about."""

@@ -63,7 +63,7 @@ class RadianceTransfer(Estimator, RadianceCache):
     order: int = 5
     """Order of the spherical harmonics of transfer: 5 (25 numbers a texel) or 6 (36), which halves the error of glossy
     light."""
-    first_rays: int = 64
+    first_rays: int = 128
     """Rays a texel before it is known whether it sees both sky and surfaces."""
     rays: int = 512
     """Rays a texel that does."""
@@ -71,7 +71,7 @@ class RadianceTransfer(Estimator, RadianceCache):
     """Rays a texel that find the surfaces from which light bounces."""
     bounces: int = 16
     """Largest number of bounces."""
-    tolerance: float = 0.002
+    tolerance: float = 0.0005
     """Share of all light that a bounce has to add, or there is no further one."""
     sun: float = 20.0
     """Radiance, in means of the sky, above which light is a sun's: it leaves the harmonics of direct light and gets a
@@ -79,9 +79,10 @@ class RadianceTransfer(Estimator, RadianceCache):
     soft_suns: bool = True
     """Whether suns are discs, with soft shadows by a ray from each camera sample to another point; else points, with
     hard shadows."""
-    glossy: Literal["auto", "transfer", "traced"] = "auto"
-    """How glossy lobes are lit: "auto" by transfer down to a roughness of ``traced_below`` and by rays below it,
-    "transfer" by transfer alone, as in the paper, "traced" by rays alone."""
+    glossy: Literal["auto", "ratio", "transfer", "traced"] = "auto"
+    """How glossy lobes are lit: "ratio" by the sky prefiltered for the lobe, of which transfer says how much occluders
+    let through; "transfer" by transfer alone, as in the paper; "traced" by rays; "auto" by the ratio down to a
+    roughness of ``traced_below``, and by rays below."""
     traced_below: float = 0.45
     """Roughness below which rays are traced for the glossy lobe, one for each of the pipeline's samples."""
     window: float = 0.005
@@ -94,7 +95,7 @@ class RadianceTransfer(Estimator, RadianceCache):
             ("term", self.term, tuple(TERM_BITS)),
             ("storage", self.storage, ("texture", "vertices")),
             ("charts", self.charts, ("auto", "xatlas", "own")),
-            ("glossy", self.glossy, ("auto", "transfer", "traced")),
+            ("glossy", self.glossy, ("auto", "ratio", "transfer", "traced")),
         )
         for name, value, known in choices:
             if value not in known:
@@ -182,7 +183,8 @@ class RadianceTransfer(Estimator, RadianceCache):
             setattr(buffers, one.term, frame[one.term])
             for order, moment in enumerate(frame.moments(one.term), 1):
                 setattr(buffers, f"{one.term}_moment{order}", moment)
-        query.traced_below = {"transfer": 0.0, "traced": 2.0}.get(self.glossy, self.traced_below)
+        query.traced_below = {"ratio": 0.0, "transfer": 0.0, "traced": 2.0}.get(self.glossy, self.traced_below)
+        query.ratio = int(self.glossy != "transfer")
         query.soft = int(self.soft_suns)
         query.traces = int(_needs_rays(frame.scene, query.traced_below))
         sky = self._sky(frame)

@@ -81,7 +81,7 @@ def transfer_work(scene: Scene, atlas: Atlas, settings: TransferSettings, device
 def transfer_rays(scene: Scene, settings: TransferSettings, device: wp.Device, seed: int) -> kernels.TransferRays:
     """Return the sets of directions of a bake, and how many rays slots have."""
     rays = kernels.TransferRays()
-    rays.bounce_rays = settings.bounce_rays if settings.bounces > 0 else 0
+    rays.bounce_rays = settings.bounce_rays  # without bounces, too: they tell which slots are inside objects
     rays.first_rays = max(min(settings.first_rays, settings.rays), rays.bounce_rays)
     rays.rays = max(settings.rays, rays.first_rays)
     rays.order, rays.seed = settings.order, seed & 0xFFFFFFFF

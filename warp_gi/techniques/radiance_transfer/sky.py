@@ -18,6 +18,7 @@ from warp_gi.scene.environment import Environment
 from warp_gi.stateful import Ahead, Service
 from warp_gi.techniques.radiance_transfer import products
 from warp_gi.techniques.radiance_transfer.lobes import SMALLEST_ROUGHNESS, lobe_table
+from warp_gi.techniques.radiance_transfer.prefiltered import prefiltered, sky_lookups
 from warp_gi.techniques.radiance_transfer.settings import LIGHT_ORDER, TransferSettings
 
 if TYPE_CHECKING:
@@ -91,7 +92,10 @@ class TransferLight(Service):
         result.whole_light = on_device(_padded(environment.harmonics_of(LIGHT_ORDER), LIGHT_WIDTH), wp.float32, device)
         result.matrix = on_device(rows.reshape(-1), wp.float32, device)
         result.lobes = lobes_on_device(order, device.alias)
-        result.rest = rest.data(device)
+        result.rest, result.scale = rest.data(device), rest.scale
+        maps = prefiltered(rest)
+        result.prefiltered.texels = maps.on(device)
+        result.prefiltered.levels, result.prefiltered.rows = maps.levels.shape[:2]
         if split:
             result.sun_count = len(split.directions)
             result.sun_directions = on_device(split.directions.astype(np.float32), wp.vec3, device)
@@ -105,6 +109,7 @@ def lobes_on_device(order: int, device: str) -> transfer_lobes.LobeTable:
     """Return the table of lobes for transfer of an order as kernels read it; made once a device."""
     table = transfer_lobes.LobeTable()
     table.entries = on_device(lobe_table(order).entries, wp.float32, get_device(device))
+    table.lookups = on_device(sky_lookups(), wp.float32, get_device(device))
     table.smallest = SMALLEST_ROUGHNESS
     return table
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from warp_gi.errors import SceneError
 from warp_gi.scene.scene import Scene
 from warp_gi.techniques.radiance_transfer.atlas import can_be_charted, scene_parts
 from warp_gi.techniques.radiance_transfer.textures import Atlas
@@ -20,13 +19,11 @@ def vertex_atlas(scene: Scene) -> Atlas:
 
     A slot lies in the first face of its vertex, a thousandth of the way to each of the other corners. Where vertices
     have no shading normals, each normal of the faces around one has slots of its own. Faces that move, and those
-    without an area, have none. Raises SceneError where no face is left.
+    without an area, have none.
     """
     flat = scene._flat
     points = flat.points[flat.indices].astype(np.float64)
     faces = np.flatnonzero(can_be_charted(points) & (scene_parts(scene)[0] >= 0))
-    if len(faces) == 0:
-        raise SceneError("no surface in this scene rests and has an area; nothing can be baked")
     sides = points[faces, 1:] - points[faces, :1]
     normals = np.cross(sides[:, 0], sides[:, 1])
     steps = np.round(normals / np.linalg.norm(normals, axis=1, keepdims=True) * NORMAL_STEPS)

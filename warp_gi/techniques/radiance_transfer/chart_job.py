@@ -1,0 +1,101 @@
+"""Runs ``chart_worker.py`` in a process of its own: xatlas cannot be interrupted, a process can be ended."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from warp_gi.errors import OptionError
+
+WORKER = Path(__file__).with_name("chart_worker.py")
+"""The program."""
+
+Progress = Callable[[float], None]
+"""Called with the share of the work that is done."""
+
+
+class ChartJob:
+    """The jobs of one atlas, which share a limit of CPU seconds; 0 is no limit.
+
+    The worker has the system end it after so much CPU time. Where the system cannot, as on Windows, wall time counts.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self.limit = seconds
+        self.used = 0.0
+        """CPU seconds of the jobs so far."""
+
+    def run(self, job: dict[str, np.ndarray], progress: Progress | None = None) -> dict[str, np.ndarray]:
+        """Return the worker's result for a job; raises OptionError where the limit is over, or the worker fails."""
+        left = max(self.limit - self.used, 1e-3) if self.limit > 0.0 else 0.0
+        with tempfile.TemporaryDirectory(prefix="warp_gi_charts_") as name:
+            folder = Path(name)
+            np.savez(folder / "job.npz", **job)  # type: ignore[arg-type]
+            code, is_late, complaint = _worked_off(folder, left, progress)
+            if code == 0:
+                with np.load(folder / "result.npz") as result:
+                    arrays = dict(result)
+                self.used += float(arrays.pop("seconds"))
+                return arrays
+        if is_late:
+            raise OptionError(
+                f"xatlas took longer than chart_seconds={self.limit:g} to make charts; give chart_seconds more or 0 (no"
+                ' limit), take the meshes\' own uv (charts="own"), or keep transfer at vertices (storage="vertices")'
+            )
+        raise OptionError(
+            f"making charts by xatlas failed ({complaint or f'exit code {code}'}); take the meshes' own uv"
+            ' (charts="own"), or keep transfer at vertices (storage="vertices")'
+        )
+
+
+def _worked_off(folder: Path, seconds: float, progress: Progress | None) -> tuple[int, bool, str]:
+    """Run the worker on a folder; return its exit code, whether it ran out of time, and its last complaint."""
+    command = [sys.executable, str(WORKER), str(folder), repr(seconds)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, env=environment, stdout=pipe, stderr=pipe, text=True) as process:
+        complaints: list[str] = []
+        listener = threading.Thread(target=lambda: complaints.extend(process.stderr or ()), daemon=True)
+        listener.start()
+        try:
+            with _clock(process, seconds) as is_late:
+                for line in process.stdout or ():
+                    if progress is not None:
+                        progress(float(line))
+                code = process.wait()
+        except BaseException:
+            process.kill()
+            raise
+        finally:
+            listener.join()
+    late = is_late.is_set() or (seconds > 0.0 and code == -getattr(signal, "SIGPROF", 0))
+    return code, code != 0 and late, complaints[-1].strip() if complaints else ""
+
+
+@contextlib.contextmanager
+def _clock(process: subprocess.Popen[str], seconds: float) -> Iterator[threading.Event]:
+    """End the process after so much wall time, unless it is 0 or the system counts CPU time; yield whether it did."""
+    is_late = threading.Event()
+    if seconds == 0.0 or hasattr(signal, "setitimer"):
+        yield is_late
+        return
+
+    def end() -> None:
+        is_late.set()
+        process.kill()
+
+    timer = threading.Timer(seconds, end)
+    timer.start()
+    try:
+        yield is_late
+    finally:
+        timer.cancel()
