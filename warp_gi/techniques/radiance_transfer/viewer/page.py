@@ -181,9 +181,8 @@ def _notes(scene: Scene, shown: Surfaces, rows: Rows) -> list[str]:
     """Return what the page does not show, or not exactly."""
     notes = []
     if shown.left_out:
-        notes.append(
-            f"Left out are {shown.left_out:,} of {scene.triangle_count:,} triangles: they move, or nothing is kept there."
-        )
+        count = f"{shown.left_out:,} of {scene.triangle_count:,}"
+        notes.append(f"Left out are {count} triangles: they move, or nothing is kept there.")
     if len(rows.components):
         notes.append(
             f"{len(rows.components)} numbers stand for the 75 of bounces, error {rows.error:.2g} of their mean."

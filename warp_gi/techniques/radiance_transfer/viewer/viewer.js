@@ -143,10 +143,7 @@ class Viewer {
   }
 
   suit() {
-    this.render();
-    const exposure = Math.min(MOST_STOPS, Math.max(-MOST_STOPS, this.drawing.suitedExposure()));
-    this.set({ exposure });
-    this.render();
+    this.set({ exposure: this.drawing.suitedExposure() });
   }
 
   set(values) {
