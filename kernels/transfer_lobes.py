@@ -17,6 +17,7 @@ NORMAL_BANDS = wp.constant(4)  # factors about the normal, at its end
 @wp.struct
 class LobeTable:
     entries: wp.array3d(dtype=wp.float32)  # [roughness, column, 8 + order]: sine, cosine, A, B, factors
+    is_white: wp.int32  # 1: lobes reflect all of a white sky; 0: as much as the entries say
     smallest: wp.float32  # roughness of the first row; the last is 1
     lookups: wp.array3d(dtype=wp.float32)  # [roughness, column, 3]: sine, cosine and level of a map of the sky
 
@@ -100,8 +101,9 @@ def lobe_at(table: LobeTable, at: TablePlace, n: wp.vec3, view: wp.vec3) -> Lobe
     m = r.normal_factors
     white = 0.25 * f[0] + 0.5 * (f[1] * c + m[0]) + 0.3125 * (f[2] * (1.5 * c2 - 0.5) + m[1])
     white = white - 0.09375 * (f[4] * ((4.375 * c2 - 3.75) * c2 + 0.375) + m[3])
-    r.factors = f / white
-    r.normal_factors = m / white
+    if table.is_white != 0:
+        r.factors = f / white
+        r.normal_factors = m / white
     return r
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import statistics_tools as st
 from scene_tools import quad, sphere
-from truth_tools import sky_of
+from truth_tools import sky_nodes, sky_of
 
 import warp_gi as gi
 from warp_gi import launch
@@ -177,3 +177,38 @@ def test_glossy_lobes_by_transfer(roughness, bound):
     seen = truth.numpy("object_id") >= 0
     mine, known = frame.numpy("environment")[seen], truth.numpy("environment")[seen]
     assert np.sqrt(((mine - known) ** 2).mean()) < bound * known.mean()
+
+
+def test_phong_is_its_integral():
+    """An open floor of the paper's lobe reflects the integral of L (s + 2) / (2 pi) cos^s(r, w) cos(n, w)."""
+    roughness = 0.9
+    shiny = gi.Material("shiny", (1.0, 1.0, 1.0), metallic=1.0, roughness=roughness)
+    scene = gi.Scene(
+        [gi.Node("floor", [quad((-1, 0, 1), (2, 0, 0), (0, 0, -2), shiny, "floor")])], environment=sky_of(slope)
+    )
+    toward = np.array([0.5, 1.0, 0.3]) / np.linalg.norm([0.5, 1.0, 0.3])
+    camera = gi.Camera.look_at(2.0 * toward, (0, 0, 0), hfov=0.2, resolution=(8, 8))
+    direct = replace(DIRECT, lobe="phong", glossy="transfer")
+    used = gi.Pipeline(environment=direct, emitters=None, indirect=None, spp=1)
+    mine = next(gi.render(scene, camera, used, device=st.device().alias)).numpy("environment").mean(axis=(0, 1))
+    directions, solid = sky_nodes()
+    mirror = np.array([-toward[0], toward[1], -toward[2]])
+    exponent = 2 / roughness**4 - 2
+    lobe = (exponent + 2) / (2 * np.pi) * np.maximum(directions @ mirror, 0) ** exponent
+    known = (slope(directions) * (lobe * np.maximum(directions[:, 1], 0) * np.ravel(solid))[:, None]).sum(axis=0)
+    np.testing.assert_allclose(mine, known, rtol=0.04)
+
+
+def test_lamps_that_move_are_refused_with_what_to_take_instead():
+    glow = gi.Material("glow", (0.0, 0.0, 0.0), specular=0.0, emission=(5.0, 5.0, 5.0))
+    scene = corner(None, gi.Node("lamp", [quad((-0.1, 0, 0.1), (0.2, 0, 0), (0, 0, -0.2), glow, "lamp")]))
+    scene.animate("lamp", [gi.Keyframe(0.0, (0, 0.9, 0)), gi.Keyframe(1.0, (0, 0.9, 0.4))])
+    with pytest.raises(gi.OptionError, match=r"lamps of this scene move.*BsdfPaths\(ends_in=RadianceTransfer"):
+        rendered(scene, pipeline(environment=None))
+
+
+def test_a_sky_of_lamps_warns():
+    pixels = np.full((64, 128, 3), 0.01, np.float32)
+    pixels[20, 40] = pixels[24, 90] = 2000.0
+    with pytest.warns(UserWarning, match="2 small lamps hold"):
+        rendered(corner(gi.Environment(pixels=pixels)), pipeline(indirect=None))

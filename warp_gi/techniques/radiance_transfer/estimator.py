@@ -15,6 +15,7 @@ from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import whole_scene
 from warp_gi.stateful import Ahead, Service
 from warp_gi.techniques.radiance_transfer.bake import bake_transfer, transfer_key
+from warp_gi.techniques.radiance_transfer.bounces import lamps_move
 from warp_gi.techniques.radiance_transfer.settings import TransferSettings
 from warp_gi.techniques.radiance_transfer.sky import SkyLight, TransferLight
 from warp_gi.techniques.radiance_transfer.state import TransferState, transfer_state
@@ -83,6 +84,9 @@ class RadianceTransfer(Estimator, RadianceCache):
     """How glossy lobes are lit: "transfer" by transfer alone, as in the paper; "ratio" by the sky prefiltered for the
     lobe, of which transfer says how much occluders let through; "traced" by rays; "auto" by transfer down to a
     roughness of ``ratio_below``, by the ratio down to ``traced_below``, and by rays below."""
+    lobe: Literal["ggx", "phong"] = "ggx"
+    """Lobe of "transfer" and "ratio": that of the materials ("ggx"), or the paper's ("phong") about the mirrored view,
+    (s + 2) / (2 pi) cos^s with s = 2 / roughness^4 - 2, which loses light towards grazing views."""
     ratio_below: float = 0.55
     """Roughness below which the ratio serves glossy lobes: above, the sky's 25 numbers are the smaller error."""
     traced_below: float = 0.45
@@ -97,6 +101,7 @@ class RadianceTransfer(Estimator, RadianceCache):
             ("term", self.term, tuple(TERM_BITS)),
             ("storage", self.storage, ("texture", "vertices")),
             ("charts", self.charts, ("auto", "xatlas", "own")),
+            ("lobe", self.lobe, ("ggx", "phong")),
             ("glossy", self.glossy, ("auto", "ratio", "transfer", "traced")),
         )
         for name, value, known in choices:
@@ -129,7 +134,7 @@ class RadianceTransfer(Estimator, RadianceCache):
     @property
     def services(self) -> tuple[Service, ...]:
         """The present sky, which both terms share."""
-        return (TransferLight(self.transfer_settings, self.sun, self.window),)
+        return (TransferLight(self.transfer_settings, self.sun, self.window, self.lobe),)
 
     # ---- the bake ----
 
@@ -150,11 +155,20 @@ class RadianceTransfer(Estimator, RadianceCache):
         camera: Camera | CameraPath | None = None,
     ) -> Bake:
         """Return transfer textures of the scene at time 0. Raises OptionError, SceneError or BakeError."""
+        self._check_lamps(scene)
         return bake_transfer(scene, self.transfer_settings, device, seed, progress)
 
     def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> TransferState:
         """Return the bake on the device; terms that share it share its memory."""
         return transfer_state(bake or self.bake(whole_scene(scene), device, seed), device)
+
+    def _check_lamps(self, scene: Scene | BakedScene) -> None:
+        """Raise OptionError for indirect light of lamps that move."""
+        if self.term == "indirect" and self.bounces > 0 and lamps_move(whole_scene(scene)):
+            raise OptionError(
+                "lamps of this scene move, and what is baked holds the bounces of lamps that rest; take "
+                "indirect=BsdfPaths(ends_in=RadianceTransfer()), which traces the first bounce of their light"
+            )
 
     # ---- frames ----
 
@@ -163,7 +177,11 @@ class RadianceTransfer(Estimator, RadianceCache):
         return False
 
     def preprocess(self, frame: Frame, state: TransferState) -> TransferState:
-        """Let the terms of equal settings know of each other, so that one launch serves them."""
+        """Let the terms of equal settings know of each other, so that one launch serves them.
+
+        Raises OptionError for indirect light of lamps that move.
+        """
+        self._check_lamps(frame.scene)
         others = frame.offered(_Together)
         frame.offer(_Together((*(others.estimators if others else ()), self)))
         return state

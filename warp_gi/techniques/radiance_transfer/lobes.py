@@ -118,6 +118,20 @@ def lobe_table(order: int) -> LobeTable:
     return LobeTable(np.stack(rows).astype(np.float32))
 
 
+@cache
+def phong_table(order: int) -> LobeTable:
+    """Return the table of the paper's lobe, modified Phong (``phong``) with s = 2 / roughness^4 - 2, about the mirror.
+
+    It reflects f0 times sum_k F_k t_k, the integral of L V (s + 2) / (2 pi) cos^s(r, w) cos(n, w): not made white.
+    """
+    cosines = (1 - np.linspace(0, 1, COLUMNS) ** 2) ** 2
+    entries = np.zeros((ROUGHNESSES, COLUMNS, 4 + order + NORMAL_BANDS))
+    entries[..., 0], entries[..., 1], entries[..., 2] = -np.sqrt(1 - cosines**2), cosines, 1.0
+    exponents = 2 / np.linspace(SMALLEST_ROUGHNESS, 1, ROUGHNESSES) ** 4 - 2
+    entries[..., 4 : 4 + order] = phong(exponents, order)[:, None]
+    return LobeTable(entries.astype(np.float32))
+
+
 def fit_ggx(roughness: float, cosines: np.ndarray, order: int) -> np.ndarray:
     """Return entries of a LobeTable for one roughness, float64 [cosines, 8 + order].
 

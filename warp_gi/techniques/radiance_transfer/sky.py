@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, ClassVar
@@ -17,7 +18,7 @@ from warp_gi.scene import harmonics
 from warp_gi.scene.environment import Environment
 from warp_gi.stateful import Ahead, Service
 from warp_gi.techniques.radiance_transfer import products
-from warp_gi.techniques.radiance_transfer.lobes import SMALLEST_ROUGHNESS, lobe_table
+from warp_gi.techniques.radiance_transfer.lobes import SMALLEST_ROUGHNESS, lobe_table, phong_table
 from warp_gi.techniques.radiance_transfer.prefiltered import prefiltered, sky_lookups
 from warp_gi.techniques.radiance_transfer.settings import LIGHT_ORDER, TransferSettings
 
@@ -53,6 +54,8 @@ class TransferLight(Service):
     """Radiance, in means of the sky, above which light is a sun's and gets a shadow ray; 0 keeps all in the sky."""
     window: float
     """Strength of the window on the light of glossy lobes."""
+    lobe: str
+    """Glossy lobe: "ggx" or "phong"."""
 
     def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> None:
         """Return None: what it makes of a sky follows from that sky alone."""
@@ -80,6 +83,8 @@ class TransferLight(Service):
         environment = environment or Environment()
         split = environment.split_sun(self.sun) if self.sun else None
         rest = split.rest if split else environment
+        if split and split.warning:
+            warnings.warn(split.warning, stacklevel=2)
         light = rest.harmonics_of(LIGHT_ORDER)
         matrix = products.light_matrix(
             light * harmonics.by_coefficient(products.window(LIGHT_ORDER, self.window)), order
@@ -91,7 +96,7 @@ class TransferLight(Service):
         result.light = on_device(_padded(light, width), wp.float32, device)
         result.whole_light = on_device(_padded(environment.harmonics_of(LIGHT_ORDER), LIGHT_WIDTH), wp.float32, device)
         result.matrix = on_device(rows.reshape(-1), wp.float32, device)
-        result.lobes = lobes_on_device(order, device.alias)
+        result.lobes = lobes_on_device(self.lobe, order, device.alias)
         result.environment_from_world = wp.mat33(*rest.world_from_environment.T.ravel())
         result.scale = rest.scale
         maps = prefiltered(rest)
@@ -106,12 +111,14 @@ class TransferLight(Service):
 
 
 @cache
-def lobes_on_device(order: int, device: str) -> transfer_lobes.LobeTable:
+def lobes_on_device(lobe: str, order: int, device: str) -> transfer_lobes.LobeTable:
     """Return the table of lobes for transfer of an order as kernels read it; made once a device."""
     table = transfer_lobes.LobeTable()
-    table.entries = on_device(lobe_table(order).entries, wp.float32, get_device(device))
+    table.entries = on_device(
+        (phong_table if lobe == "phong" else lobe_table)(order).entries, wp.float32, get_device(device)
+    )
     table.lookups = on_device(sky_lookups(), wp.float32, get_device(device))
-    table.smallest = SMALLEST_ROUGHNESS
+    table.smallest, table.is_white = SMALLEST_ROUGHNESS, int(lobe != "phong")
     return table
 
 
