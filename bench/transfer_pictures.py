@@ -1,4 +1,4 @@
-"""Renders the pictures of docs/techniques/radiance_transfer.md: ``python -m warp_gi.bench.transfer_pictures [NAME...]``.
+"""Renders pictures of docs/techniques/radiance_transfer.md: ``python -m warp_gi.bench.transfer_pictures [NAME...]``.
 
 Each of `SHEETS`, or those that are named, becomes assets/transfer_NAME.jpg: pictures of transfer textures at a limit of
 theirs, beside the path tracer's. Skies and the living room are files in WARP_GI_SCENES; sheets whose files are missing
@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -64,9 +64,20 @@ def rendered(scene: gi.Scene, camera: gi.Camera, pipeline: gi.Pipeline, device: 
     return next(gi.render(scene, camera, pipeline, device=device, **more)).numpy("beauty")
 
 
-def by_paths(scene: gi.Scene, device: str, camera: gi.Camera | None = None, spp: int = REFERENCE_SAMPLES) -> np.ndarray:
-    """Return the path tracer's picture."""
-    return rendered(scene, camera or court_camera(SIZE), gi.Pipeline(spp=spp), device)
+def by_paths(scene: gi.Scene, device: str, camera: gi.Camera | None = None, direct: bool = False) -> np.ndarray:
+    """Return the path tracer's picture; ``direct`` leaves out light over other surfaces."""
+    pipeline = gi.Pipeline(spp=REFERENCE_SAMPLES)
+    return rendered(
+        scene, camera or court_camera(SIZE), replace(pipeline, indirect=None) if direct else pipeline, device
+    )
+
+
+def metal(environment: gi.Environment, roughness: float) -> gi.Scene:
+    """Return the court in metal."""
+    scene = court(environment, specular=1.0, roughness=roughness)
+    for material in scene.materials:
+        material.metallic = 1.0
+    return scene
 
 
 class Baked:
@@ -78,16 +89,24 @@ class Baked:
         self.settings = {"resolution": TEXELS, **settings}
         self.bake = gi.bake(scene, gi.RadianceTransfer(**self.settings), device)
 
-    def picture(self, environment: gi.Environment | None = None, **settings: Any) -> np.ndarray:
-        """Return a picture by transfer, under another sky if given."""
+    def picture(
+        self, environment: gi.Environment | None = None, direct: bool = False, ends_in: bool = False, **settings: Any
+    ) -> np.ndarray:
+        """Return a picture by transfer.
+
+        Args:
+            environment: Another sky.
+            direct: Leave out light over other surfaces.
+            ends_in: Trace the sky's light, and a first bounce that ends in the textures.
+            settings: Settings of RadianceTransfer that are not those of the bake.
+        """
         if environment is not None:
             self.scene.environment = environment
-        used = {**self.settings, **settings}
-        pipeline = gi.Pipeline(
-            environment=gi.RadianceTransfer(**used),
-            indirect=gi.RadianceTransfer(**used, term="indirect"),
-            spp=SAMPLES,
-        )
+        here, over = (gi.RadianceTransfer(**self.settings, **settings, term=t) for t in ("environment", "indirect"))
+        pipeline = gi.Pipeline(environment=here, indirect=None if direct else over, spp=SAMPLES)
+        if ends_in:
+            paths = gi.BsdfPaths(ends_in=over)
+            pipeline = gi.Pipeline(indirect=paths, spp=SAMPLES)
         return rendered(self.scene, self.camera, pipeline, self.device, bakes=[self.bake])
 
 
@@ -103,28 +122,28 @@ def turned(device: str) -> list[Row]:
 
 
 def glossy(device: str) -> list[Row]:
-    """Return forms of glossy light at two roughnesses, beside the path tracer."""
+    """Return forms of the sky's glossy light at two roughnesses, beside the path tracer."""
     rows = []
     for roughness in (0.7, 0.45):
-        scene = court(sky("courtyard"), specular=1.0, roughness=roughness)
-        for material in scene.materials:
-            material.metallic = 1.0
+        scene = metal(sky("courtyard"), roughness)
         baked = Baked(scene, device)
-        row = [(f"{form}, roughness {roughness}", baked.picture(glossy=form)) for form in ("transfer", "ratio")]
-        row.append((f"traced, {SAMPLES} rays", baked.picture(glossy="traced")))
-        rows.append([*row, ("paths", by_paths(scene, device))])
+        row = [
+            (f"{form}, roughness {roughness}", baked.picture(glossy=form, direct=True))
+            for form in ("transfer", "ratio")
+        ]
+        row.append((f"traced, {SAMPLES} rays", baked.picture(glossy="traced", direct=True)))
+        rows.append([*row, ("paths", by_paths(scene, device, direct=True))])
     return rows
 
 
 def orders(device: str) -> list[Row]:
     """Return transfer of 25 and of 36 numbers on glossy surfaces under a sky of 25, beside the path tracer."""
-    scene = court(band_limited(sky("courtyard")), specular=1.0, roughness=0.5)
-    for material in scene.materials:
-        material.metallic = 1.0
+    scene = metal(band_limited(sky("courtyard")), 0.5)
     row = [
-        (f"order {order}", Baked(scene, device, order=order).picture(glossy="transfer", sun=0.0)) for order in (5, 6)
+        (f"order {order}", Baked(scene, device, order=order).picture(glossy="transfer", sun=0.0, direct=True))
+        for order in (5, 6)
     ]
-    return [[*row, ("paths", by_paths(scene, device))]]
+    return [[*row, ("paths", by_paths(scene, device, direct=True))]]
 
 
 def vertices(device: str) -> list[Row]:
@@ -148,7 +167,7 @@ def sun(device: str) -> list[Row]:
 
 
 def losses(device: str) -> list[Row]:
-    """Return a sky of a few lamps, and an interior, beside the path tracer."""
+    """Return a sky of a few lamps, an interior, and reflections of other surfaces, beside the path tracer."""
     scene = court(sky("studio"))
     baked = Baked(scene, device)
     studio = [("few lamps, in the harmonics", baked.picture(sun=0.0)), ("few lamps, apart", baked.picture())]
@@ -160,7 +179,11 @@ def losses(device: str) -> list[Row]:
         baked = Baked(room, device, camera, resolution=resolution)
         interior.append((f"interior, texture {resolution}", baked.picture()))
     interior.append(("paths", by_paths(room, device, camera)))
-    return [studio, interior]
+    scene = metal(sky("courtyard"), 0.5)
+    baked = Baked(scene, device)
+    mirrored = [("reflections, ratio", baked.picture()), ("paths that end in it", baked.picture(ends_in=True))]
+    mirrored.append(("paths", by_paths(scene, device)))
+    return [studio, interior, mirrored]
 
 
 _COURTYARD = ("environments/courtyard.exr",)
@@ -170,7 +193,7 @@ SHEETS = {
     "orders": Sheet(orders, _COURTYARD),
     "vertices": Sheet(vertices, _COURTYARD),
     "sun": Sheet(sun, ("environments/city.exr",)),
-    "losses": Sheet(losses, ("environments/studio.exr", LIVING_ROOM)),
+    "losses": Sheet(losses, ("environments/studio.exr", LIVING_ROOM, *_COURTYARD)),
 }
 """Sheets by name."""
 

@@ -30,7 +30,9 @@ def replacing(path: str | Path, own_folder: bool = False) -> Iterator[Path]:
     file = part / path.name if own_folder else part
     try:
         file.write_bytes(b"")
+        mode = file.stat().st_mode
         yield file
+        file.chmod(mode)  # some writers replace the file by one that its owner alone may read
         with open(file, "rb+") as written:
             os.fsync(written.fileno())
         os.replace(file, path)
