@@ -45,7 +45,7 @@ class RadianceTransfer(Estimator, RadianceCache):
     Source: Sirikonda et al., "Precomputed Radiance Transfer Textures" (prt_textures.txt).
     """
 
-    term: str = "environment"
+    term: str = "environment"  # type: ignore[misc]  # a field: one class serves two terms
     """Term of the light: "environment" is direct light from the sky, "indirect" light that was reflected before."""
     storage: Literal["texture", "vertices"] = "texture"
     """Where transfer is kept: in texels of an atlas ("texture"), or at the vertices of meshes ("vertices"), as a
