@@ -175,7 +175,7 @@ def losses(device: str) -> list[Row]:
     place = PLACES["living_room_white"]
     room, camera = place.scene(), place.path().at_resolution(*SIZE).camera(0)
     interior: Row = []
-    for resolution in (256, 1024):
+    for resolution in (512, 1024):
         baked = Baked(room, device, camera, resolution=resolution)
         interior.append((f"interior, texture {resolution}", baked.picture()))
     interior.append(("paths", by_paths(room, device, camera)))

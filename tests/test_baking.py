@@ -240,12 +240,10 @@ def test_check_says_why():
     message = unsuitable(bake, "LightFieldProbes", OTHER_KEY, {})
     assert "by 'VisibilityField', not by 'LightFieldProbes'" in message
     assert unsuitable(bake, "VisibilityField", OTHER_KEY, {}, "hall\n2") == (
-        "this bake is of scene 'atrium' (hash ab12cd34ef56), "
-        "not of 'hall\\n2' (hash 0123456789ab): bake it again"
+        "this bake is of scene 'atrium' (hash ab12cd34ef56), not of 'hall\\n2' (hash 0123456789ab): bake it again"
     )
-    assert (
-        "is of an unnamed scene (hash ab12cd34ef56), not of an unnamed scene (hash 0123456789ab)"
-        in unsuitable(make_bake(scene_name=""), "VisibilityField", OTHER_KEY, {})
+    assert "is of an unnamed scene (hash ab12cd34ef56), not of an unnamed scene (hash 0123456789ab)" in unsuitable(
+        make_bake(scene_name=""), "VisibilityField", OTHER_KEY, {}
     )
     assert unsuitable(bake, "VisibilityField", OTHER_KEY, {}, "atrium") == (
         "this bake is of scene 'atrium' as it was (hash ab12cd34ef56, now 0123456789ab): "
