@@ -152,3 +152,28 @@ def test_what_moves_receives_light():
     assert card.sum() > 20
     for term in ("environment", "indirect"):
         assert frame.numpy(term)[card].mean() == pytest.approx(truth.numpy(term)[card].mean(), rel=0.05), term
+
+
+@pytest.mark.parametrize("roughness", [0.1, 0.4])
+def test_sharp_lobes_are_traced(roughness):
+    """By rays, so without bias in direct light; what rays meet is lit by the textures."""
+    shiny = gi.Material("shiny", (0.9, 0.8, 0.7), metallic=1.0, roughness=roughness)
+    mirror = gi.Node("mirror", [quad((-0.9, 0.02, 0.9), (0.8, 0, 0), (0, 0, -0.8), shiny, "mirror")])
+    scene = corner(sky_of(slope), mirror)
+    frame, truth = rendered(scene, pipeline(spp=256)), rendered(scene, gi.Pipeline(spp=2048))
+    seen = (truth.numpy("object_id") == 1) & (frame.numpy("object_id") == 1)
+    assert seen.sum() > 40
+    for term, bound in (("environment", 0.02), ("indirect", 0.06)):
+        assert frame.numpy(term)[seen].mean() == pytest.approx(truth.numpy(term)[seen].mean(), rel=bound), term
+
+
+@pytest.mark.parametrize(("roughness", "bound"), [(0.8, 0.06), (0.6, 0.12)])
+def test_glossy_lobes_by_transfer(roughness, bound):
+    """Under a sky of few numbers, direct light of a rough metal is near the truth."""
+    shiny = gi.Material("shiny", (0.9, 0.8, 0.7), metallic=1.0, roughness=roughness)
+    scene = gi.Scene([gi.Node("ball", [sphere((0.0, 0.5, 0.0), 0.5, shiny, rows=12)])], environment=sky_of(slope))
+    frame = rendered(scene, pipeline(environment=replace(DIRECT, rays=256), indirect=None))
+    truth = rendered(scene, gi.Pipeline(spp=1024, indirect=None))
+    seen = truth.numpy("object_id") >= 0
+    mine, known = frame.numpy("environment")[seen], truth.numpy("environment")[seen]
+    assert np.sqrt(((mine - known) ** 2).mean()) < bound * known.mean()
