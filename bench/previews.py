@@ -80,7 +80,7 @@ def write_readme_pictures(root: Path, spp: int | None = None, device: str = "cpu
     """Write `README_PICTURES` under a folder, and print the files; ``spp`` None is each one's own. Raises OSError."""
     for file, picture in README_PICTURES.items():
         pixels = tiled(picture if spp is None else replace(picture, spp=spp), device)
-        _write_jpeg(root / file, pixels)
+        write_jpeg(root / file, pixels)
         print(f"wrote {root / file}", flush=True)
 
 
@@ -91,7 +91,8 @@ def tiled(picture: ReadmePicture, device: str = "cpu") -> np.ndarray:
     return np.vstack(rows)
 
 
-def _write_jpeg(path: Path, pixels: np.ndarray) -> None:
+def write_jpeg(path: Path, pixels: np.ndarray) -> None:
+    """Write uint8 [height, width, 3] as JPEG; the file appears whole or not at all. Raises OSError."""
     from PIL import Image
 
     with replacing(path) as part:

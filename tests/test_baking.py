@@ -73,6 +73,11 @@ def test_bakes_come_back_bit_equal(tmp_path):
     assert load_bake(path).arrays["int32/(5, 3)"].tobytes() == arrays["int32/(5, 3)"].tobytes()
 
 
+def test_others_may_read_what_they_may_read_of_any_file(tmp_path):
+    (tmp_path / "plain").write_bytes(b"")
+    assert make_bake().save(tmp_path / "a.bake").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
 def test_other_layouts_come_back_by_value(tmp_path):
     values = np.arange(24, dtype=np.float32).reshape(4, 6)
     frozen = values.copy()
@@ -235,12 +240,14 @@ def test_check_says_why():
     message = unsuitable(bake, "LightFieldProbes", OTHER_KEY, {})
     assert "by 'VisibilityField', not by 'LightFieldProbes'" in message
     assert unsuitable(bake, "VisibilityField", OTHER_KEY, {}, "hall\n2") == (
-        "this bake is of scene 'atrium' (geometry ab12cd34ef56), "
-        "not of 'hall\\n2' (geometry 0123456789ab): bake it again"
+        "this bake is of scene 'atrium' (hash ab12cd34ef56), not of 'hall\\n2' (hash 0123456789ab): bake it again"
     )
-    assert (
-        "is of an unnamed scene (geometry ab12cd34ef56), not of an unnamed scene (geometry 0123456789ab)"
-        in unsuitable(make_bake(scene_name=""), "VisibilityField", OTHER_KEY, {})
+    assert "is of an unnamed scene (hash ab12cd34ef56), not of an unnamed scene (hash 0123456789ab)" in unsuitable(
+        make_bake(scene_name=""), "VisibilityField", OTHER_KEY, {}
+    )
+    assert unsuitable(bake, "VisibilityField", OTHER_KEY, {}, "atrium") == (
+        "this bake is of scene 'atrium' as it was (hash ab12cd34ef56, now 0123456789ab): "
+        "what it depends on has changed since; bake it again"
     )
 
     del asked["thin"]

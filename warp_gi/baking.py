@@ -103,6 +103,11 @@ class Bake:
             raise BakeError(
                 f"this bake is by {self.technique!r}, not by {technique!r}: name its own file or bake it again"
             )
+        if scene_key != self.scene_key and self.scene_name and scene_name == self.scene_name:
+            raise BakeError(
+                f"this bake is of scene {scene_name!r} as it was (hash {self.scene_key[:12]}, now {scene_key[:12]}): "
+                "what it depends on has changed since; bake it again"
+            )
         if scene_key != self.scene_key:
             raise BakeError(
                 f"this bake is of {'scene ' if self.scene_name else ''}{_scene(self.scene_name, self.scene_key)}, "
@@ -228,7 +233,7 @@ def _plain(kind: str, values: Mapping[str, Any]) -> dict[str, str | int | float]
 
 
 def _scene(name: str, key: str) -> str:
-    return f"{repr(name) if name else 'an unnamed scene'} (geometry {key[:12]})"
+    return f"{repr(name) if name else 'an unnamed scene'} (hash {key[:12]})"
 
 
 def _shown(settings: Mapping[str, Setting], name: str) -> str:

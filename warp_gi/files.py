@@ -30,7 +30,9 @@ def replacing(path: str | Path, own_folder: bool = False) -> Iterator[Path]:
     file = part / path.name if own_folder else part
     try:
         file.write_bytes(b"")
+        mode = file.stat().st_mode
         yield file
+        file.chmod(mode)  # some writers replace the file by one that its owner alone may read
         with open(file, "rb+") as written:
             os.fsync(written.fileno())
         os.replace(file, path)
@@ -44,8 +46,11 @@ def replacing(path: str | Path, own_folder: bool = False) -> Iterator[Path]:
 def check_writable(folder: Path) -> None:
     """Make the folder; raises OSError now, not after an hour's work, if nothing can be written there."""
     folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryFile(dir=folder):
-        pass
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OSError(error.errno, "nothing can be written to this folder", str(folder)) from error
 
 
 def remove_stale_parts(path: str | Path) -> None:

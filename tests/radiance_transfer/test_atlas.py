@@ -333,7 +333,9 @@ def test_given_texel_sets(name):
     assert finer == pytest.approx(4.0, rel=0.3)
 
 
-@pytest.mark.parametrize("text", ["", "all", "toy=", "toy=0", "toy=-1", "toy=nan", "=2", "toy=2,", "toy=2,wall"])
+@pytest.mark.parametrize(
+    "text", ["", "all", "toy=", "toy=0", "toy=1e4", "toy=-1", "toy=nan", "=2", "toy=2,", "toy=2,wall"]
+)
 def test_bad_texel_sets(text):
     with pytest.raises(gi.OptionError, match="texel_sets must be"):
         parse_texel_sets(text)

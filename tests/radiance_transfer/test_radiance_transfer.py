@@ -134,6 +134,20 @@ def test_paths_end_in_it():
     assert errors["ends"] < 0.92 * errors["plain"], errors
 
 
+@pytest.mark.parametrize("term", ["environment", "indirect"])
+def test_a_term_and_the_cache_of_another_go_together(term):
+    """The cache stands for no term, whatever its own is; the sky's term is as without it."""
+    scene = corner(1.0)
+    bake = gi.bake(scene, DIRECT, st.device().alias)
+    cached = gi.BsdfPaths(ends_in=replace(DIRECT, term=term))
+    both = rendered(scene, gi.Pipeline(environment=DIRECT, emitters=None, indirect=cached), bakes=[bake])
+    alone = rendered(scene, gi.Pipeline(environment=DIRECT, emitters=None, indirect=None), bakes=[bake])
+    paths = rendered(scene, gi.Pipeline(environment=None, emitters=None, indirect=cached), bakes=[bake])
+    assert alone.numpy("environment").mean() > 0.1
+    np.testing.assert_allclose(both.numpy("environment"), alone.numpy("environment"), rtol=1e-6)
+    np.testing.assert_array_equal(both.numpy("indirect"), paths.numpy("indirect"))
+
+
 def flying(sky: object) -> gi.Scene:
     """Return the corner with a card above it that moves."""
     card = gi.Node("card", [quad((-0.4, 0, 0.4), (0.8, 0, 0), (0, 0, -0.8), RED, "card")])

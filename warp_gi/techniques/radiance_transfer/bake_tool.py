@@ -106,7 +106,9 @@ class RadianceTransferTool(BakeTool[RadianceTransfer]):
         ]
         if "bounces" in counts:
             rows += [("bounces", int(counts["bounces"])), ("share of the last", float(counts["last_share"]))]
-            rows.append(("share of its rays that find nothing kept", float(counts["black_share"])))
+            if "lamp_bounces" in counts:
+                rows.append(("bounces of lamps", int(counts["lamp_bounces"])))
+            rows.append(("share of bounces' rays on surfaces without slots", float(counts["black_share"])))
         return [
             *rows,
             ("bytes a slot", sum(array.nbytes for array in values) // slots),

@@ -15,6 +15,8 @@ COVERED = 0.5
 """About the share of a page that surfaces cover."""
 MOST_FACTOR = 32.0
 """Largest factor by which a density is raised above that of the others."""
+LEAST_GIVEN, MOST_GIVEN = 1e-3, 1e3
+"""Smallest and largest factor that may be given: beyond, meshes would be left without texels."""
 LARGEST_SHARE = 0.25
 """Share of all texels that meshes of raised density may take, about."""
 
@@ -33,10 +35,10 @@ def parse_texel_sets(text: str) -> dict[str, float] | None:
             factor = float(number)
         except ValueError:
             factor = math.nan
-        if not (name and equals and math.isfinite(factor) and factor > 0.0):
+        if not (name and equals and LEAST_GIVEN <= factor <= MOST_GIVEN):
             raise OptionError(
                 'texel_sets must be "auto", "one", or "NAME=FACTOR,..." with the name of a node or mesh and a factor'
-                f" above 0 of its texels a metre, got {text!r}"
+                f" of its texels a metre, from {LEAST_GIVEN:g} to {MOST_GIVEN:g}, got {text!r}"
             )
         if name in factors:
             raise OptionError(f"texel_sets names {name!r} twice, in {text!r}")

@@ -188,13 +188,17 @@ class RadianceTransfer(Estimator, RadianceCache):
 
     def give(self, frame: Frame, state: TransferState) -> None:
         """Let paths end in what is known of light that was reflected before."""
+        frame.offer(_Lent(self))
         frame.paths.use_cache(transfer_light.TRANSFER_CACHE, transfer_cache(state, self._sky(frame)))
 
     def trace(self, frame: Frame, state: TransferState) -> None:
         """Add the light of the current camera sample, of all terms with these settings at once."""
-        together = frame.offered(_Together)
-        alike = [one for one in together.estimators if replace(one, term=self.term) == self] if together else [self]
-        if alike[0] is not self:
+        together, lent = frame.offered(_Together), frame.offered(_Lent)
+        terms = list(together.estimators) if together else [self]
+        if lent is not None:
+            terms.remove(lent.cache)
+        alike = [one for one in terms if replace(one, term=self.term) == self]
+        if alike[0].term != self.term:
             return  # the first of them did it
         query, buffers = transfer_shade.TransferQuery(), transfer_shade.TransferBuffers()
         buffers.width, buffers.height = frame.camera.resolution
@@ -252,6 +256,13 @@ def _needs_rays(scene: Scene | BakedScene, traced_below: float) -> bool:
     sharp = (one.roughness < traced_below or one.metallic_roughness_texture for one in whole_scene(scene).materials)
     shiny = (one.specular > 0 or one.metallic > 0 for one in whole_scene(scene).materials)
     return scene.is_animated or any(a and b for a, b in zip(sharp, shiny, strict=True))
+
+
+@dataclass(frozen=True)
+class _Lent:
+    """The cache in which paths end: it preprocesses as terms do, but is none."""
+
+    cache: RadianceTransfer
 
 
 @dataclass(frozen=True)

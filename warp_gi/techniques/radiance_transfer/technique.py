@@ -26,5 +26,6 @@ TECHNIQUE = Technique(
         },
     },
     bake_tool="bake_tool",
+    page="techniques/radiance_transfer.md",
     samplers=("transfer_light.TRANSFER_CACHE",),
 )
