@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_gi.kernels.gbuffer import PassSettings, PrimaryHits, tiled_pixel
-from warp_gi.kernels.sampling import OWN_DIMENSION, pixel_sample_index, pixel_seed, sample_2d
+from warp_gi.kernels.sampling import TRANSFER_SUN_DIMENSION, pixel_sample_index, pixel_seed, sample_2d
 from warp_gi.kernels.surface import Surface, surface_at
 from warp_gi.kernels.transfer_atlas import SlotFetch
 from warp_gi.kernels.transfer_light import (
@@ -23,7 +23,6 @@ wp.set_module_options({"enable_backward": False})
 
 WANTS_ENVIRONMENT = wp.constant(1)
 WANTS_INDIRECT = wp.constant(2)
-SUN_DIMENSION = wp.constant(OWN_DIMENSION + 1)  # by camera sample
 
 
 # What a launch is asked for.
@@ -63,7 +62,7 @@ def sun_point(settings: PassSettings, p: wp.vec2i, soft: wp.int32) -> wp.vec2:
         return wp.vec2(0.0, 0.0)
     index = pixel_sample_index(p[0], p[1], settings.camera_sample, settings.camera_bits)
     seed = pixel_seed(p[0], p[1], settings.camera_bits, settings.seed)
-    return sample_2d(index, seed, SUN_DIMENSION)
+    return sample_2d(index, seed, TRANSFER_SUN_DIMENSION)
 
 
 # Adds radiance that stands for `count` equal samples.

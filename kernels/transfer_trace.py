@@ -18,7 +18,7 @@ from warp_gi.kernels.path_trace import (
     PathSettings,
     path_tracer,
 )
-from warp_gi.kernels.sampling import OWN_DIMENSION, pixel_sample_index, pixel_seed, sample_2d
+from warp_gi.kernels.sampling import TRANSFER_LOBE_DIMENSION, pixel_sample_index, pixel_seed, sample_2d
 from warp_gi.kernels.surface import Surface, ray_origin, surface_at
 from warp_gi.kernels.transfer_atlas import SlotFetch
 from warp_gi.kernels.transfer_light import (
@@ -102,7 +102,7 @@ def lobe_light(
     index: wp.uint32,
     seed: wp.uint32,
 ) -> wp.vec3:
-    b = specular_sample(s.bsdf, wo, sample_2d(index, seed, OWN_DIMENSION))
+    b = specular_sample(s.bsdf, wo, sample_2d(index, seed, TRANSFER_LOBE_DIMENSION))
     if b.pdf <= 0.0:
         return wp.vec3(0.0, 0.0, 0.0)
     wi = s.shading * b.wi
