@@ -28,6 +28,7 @@ wp.set_module_options({"enable_backward": False})
 
 MEAN_OF_FIRST = wp.constant(wp.float32(0.2820948))  # a sky's mean over its first coefficient
 LEAST_OF_MEAN = wp.constant(wp.float32(0.05))  # what the light of an open lobe counts as at least, in means of the sky
+BROAD = wp.constant(wp.float32(0.7))  # roughness of the lobe, at least, by which occlusion is told
 MOST_SHARE = wp.constant(wp.float32(1.5))  # of the light of an open lobe
 
 
@@ -101,8 +102,10 @@ def diffuse_radiance(rows: TransferRows, sky: TransferSky, s: Surface, at: SlotF
 
 
 # Radiance of the sky, without suns, that the glossy lobe reflects towards the unit direction `view`: by transfer alone
-# or, below a roughness, of the prefiltered sky the share that transfer says the occluders let through. The sky of 25
-# numbers may come near 0 or below it where the real one does not, so that share is bounded, and what it divides by.
+# or, below a roughness, of the prefiltered sky the share that transfer says the occluders let through. That share is
+# a broader lobe's, which 25 numbers can hold: in a court of rough metal errors at roughness .5 are half of those with
+# the lobe itself. The sky of 25 numbers may come near 0 or below it where the real one does not, so the share is
+# bounded, and what it divides by.
 @wp.func
 def glossy_radiance(
     rows: TransferRows, sky: TransferSky, ratio_below: wp.float32, s: Surface, at: SlotFetch, view: wp.vec3
@@ -110,7 +113,10 @@ def glossy_radiance(
     normal = shading_normal(s)
     roughness = wp.sqrt(s.bsdf.alpha)
     place = table_place(sky.lobes, roughness, wp.dot(normal, view))
-    lobe = lobe_at(sky.lobes, place, normal, view)
+    shading = place
+    if roughness < ratio_below:
+        shading = table_place(sky.lobes, wp.max(roughness, BROAD), wp.dot(normal, view))
+    lobe = lobe_at(sky.lobes, shading, normal, view)
     products = glossy_product(
         rows.transfer,
         rows.width,
@@ -129,7 +135,8 @@ def glossy_radiance(
             least = LEAST_OF_MEAN * MEAN_OF_FIRST * sky.light[c * rows.width]
             share = wp.clamp(light[c] / wp.max(products[3 + c], wp.max(least, 1.0e-20)), 0.0, MOST_SHARE)
             light[c] = open[c] * sky.scale * share
-    reflected = s.bsdf.f0 * lobe.scale + wp.vec3(1.0, 1.0, 1.0) * (s.bsdf.f90 * lobe.offset)
+    offset = s.bsdf.f90 * table_entry(sky.lobes.entries, place, 3)
+    reflected = s.bsdf.f0 * table_entry(sky.lobes.entries, place, 2) + wp.vec3(offset, offset, offset)
     return wp.cw_mul(reflected, light)
 
 

@@ -39,13 +39,10 @@ class TablePlace:
     right: wp.float32
 
 
-# A lobe in the plane of normal and view. It reflects f0 A + f90 B of light from everywhere, times what its factors, of
-# albedo 1, reflect of the light that there is.
+# A lobe in the plane of normal and view, of albedo 1. GGX is that times f0 A + f90 B, numbers 2 and 3 of an entry.
 @wp.struct
 class Lobe:
     direction: wp.vec3  # world space, unit
-    scale: wp.float32  # A
-    offset: wp.float32  # B
     factors: vec6  # about the direction
     normal_factors: wp.vec4  # about the normal, of bands 1 to 4
 
@@ -89,8 +86,6 @@ def lobe_at(table: LobeTable, at: TablePlace, n: wp.vec3, view: wp.vec3) -> Lobe
     side = wp.vec2(table_entry(e, at, 0), table_entry(e, at, 1))
     side = side / wp.length(side)
     r.direction = in_plane(n, view, side[0], side[1])
-    r.scale = table_entry(e, at, 2)
-    r.offset = table_entry(e, at, 3)
     for l in range(order):
         r.factors[l] = table_entry(e, at, HEAD + l)
     for l in range(NORMAL_BANDS):

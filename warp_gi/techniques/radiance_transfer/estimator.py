@@ -87,7 +87,7 @@ class RadianceTransfer(Estimator, RadianceCache):
     lobe: Literal["ggx", "phong"] = "ggx"
     """Lobe of "transfer" and "ratio": that of the materials ("ggx"), or the paper's ("phong") about the mirrored view,
     (s + 2) / (2 pi) cos^s with s = 2 / roughness^4 - 2, which loses light towards grazing views."""
-    ratio_below: float = 0.55
+    ratio_below: float = 0.65
     """Roughness below which the ratio serves glossy lobes: above, the sky's 25 numbers are the smaller error."""
     traced_below: float = 0.45
     """Roughness below which rays are traced for the glossy lobe, one for each of the pipeline's samples."""
@@ -121,6 +121,10 @@ class RadianceTransfer(Estimator, RadianceCache):
                 raise OptionError(f"{name} must be a whole number from {low} to {high}, got {value!r}")
         if self.rays < self.first_rays:
             raise OptionError(f"rays must be at least first_rays ({self.first_rays}), got {self.rays}")
+        if 0 < self.sun <= 1:
+            raise OptionError(f"sun must be 0 (no suns apart) or a number of means above 1, got {self.sun}")
+        if self.term == "indirect" and self.bounces == 0:
+            raise OptionError('term "indirect" needs bounces of at least 1, got 0: leave the term out (None)')
         for name in ("chart_seconds", "tolerance", "sun", "ratio_below", "traced_below", "window"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
