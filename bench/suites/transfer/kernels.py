@@ -35,7 +35,7 @@ _SPARSE = """
 #else
         const wp::half* numbers = row;
 #endif
-        for (int i = 0; i < 25; ++i) t[i] += float(numbers[i]) * shares[k];
+        for (int i = 0; i < 25; ++i) t[i] += static_cast<float>(numbers[i]) * shares[k];
     }
     const int count = terms.shape[0];
     if (reordered) {
