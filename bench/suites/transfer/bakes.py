@@ -37,7 +37,7 @@ REFERENCE_RAYS = 8192
 def bake_rows(quick: bool, device: str) -> list[Row]:
     """Return rows of rays, errors and whole bakes by scene."""
     rows: list[Row] = []
-    for key in ("atrium",) if quick else PLACES_BAKED:
+    for key in ("sphere_row",) if quick else PLACES_BAKED:
         place = PLACES[key]
         said = {"table": UNIFORM, "case": place.title}
         if place.missing:
@@ -57,9 +57,7 @@ def place_rows(name: str, scene: gi.Scene, quick: bool, device: str) -> list[Row
     return [*rows, whole_row(name, scene, estimator, device), chart_row(name, scene, estimator, device)]
 
 
-def ray_row(
-    name: str, scene: gi.Scene, atlas: Atlas, estimator: gi.RadianceTransfer, count: int, device: str
-) -> Row:
+def ray_row(name: str, scene: gi.Scene, atlas: Atlas, estimator: gi.RadianceTransfer, count: int, device: str) -> Row:
     """Return CPU seconds of 256 rays a slot, for blocks of slots all over the atlas, scaled to 2^20 slots."""
     starts = np.linspace(0, max(atlas.count - BLOCK, 0), max(count // BLOCK, 1)).astype(int)
     chosen = np.unique(np.concatenate([np.arange(start, min(start + BLOCK, atlas.count)) for start in starts]))

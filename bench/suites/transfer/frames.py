@@ -44,7 +44,10 @@ class OneTerm:
         terms = dict.fromkeys(TERMS) | {"environment": estimator}
         pipeline = gi.Pipeline(**terms, spp=spp, camera_samples=1)
         scheduler = gi.FrameScheduler(scene, camera, pipeline, device, bakes=bakes)
-        return OneTerm(scheduler, scheduler.frame(0))
+        drawn = scheduler.frame(0)
+        for service in estimator.services:  # what they handed over ended with the frame
+            service.preprocess(drawn, scheduler.state(service.name))
+        return OneTerm(scheduler, drawn)
 
     def term(self, turn: int = 0) -> None:
         """Do the light once more."""
@@ -68,7 +71,7 @@ class OneTerm:
 def frame_rows(quick: bool, device: str) -> list[Row]:
     """Return rows of all scenes."""
     rows: list[Row] = []
-    for key in ("atrium",) if quick else ("living_room_white", "sponza"):
+    for key in ("sphere_row",) if quick else ("living_room_white", "sponza"):
         place = PLACES[key]
         said = {"table": TABLE, "case": place.title.partition(",")[0]}
         if place.missing:

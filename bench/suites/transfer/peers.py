@@ -20,13 +20,15 @@ from warp_gi.frame import TERMS
 
 TABLE = "beside Mitsuba at equal error"
 SPP, QUICK_SPP = 16, 4
-INTEGRATOR = {"type": "direct", "bsdf_samples": 1, "emitter_samples": 1, "hide_emitters": True}
+INTEGRATOR = {"type": "direct", "bsdf_samples": 1, "emitter_samples": 1}
 
 
 def peer_rows(quick: bool, device: str) -> list[Row]:
     """Return rows of the court and of Sponza, Lambert, under a smooth sky."""
     size = (96, 64) if quick else (480, 270)
-    rows = equal_error("court", court(smooth_sky()), court_camera(size), quick, device)
+    flat = peer_scene(court(smooth_sky()), diffuse=True)  # a material may not be on flat and smooth meshes in Mitsuba
+    flat.environment = smooth_sky()
+    rows = equal_error("court", flat, court_camera(size), quick, device)
     place = PLACES["sponza"]
     if quick:
         return rows
@@ -46,7 +48,7 @@ def equal_error(name: str, scene: gi.Scene, camera: gi.Camera, quick: bool, devi
         return [said | {"skipped": str(missing)}]
     estimator = gi.RadianceTransfer(bounces=0, resolution=256 if quick or name == "court" else 1024)
     bake = gi.bake(scene, estimator, device)
-    view = TermView(scene, camera, "environment", 64 if quick else 512, device, camera_samples=64)
+    view = TermView(scene, camera, "environment", 64 if quick else 512, device, 64, "beauty")
 
     def ours(used: object, samples: int) -> gi.FrameScheduler:
         terms = dict.fromkeys(TERMS) | {"environment": used}
@@ -55,8 +57,8 @@ def equal_error(name: str, scene: gi.Scene, camera: gi.Camera, quick: bool, devi
 
     transfer, traced = ours(estimator, spp), ours(gi.TracedEnvironment(), spp)
     works = {
-        "transfer": lambda turn: transfer.frame(turn).numpy("environment").copy(),
-        "traced": lambda turn: traced.frame(turn).numpy("environment").copy(),
+        "transfer": lambda turn: transfer.frame(turn).numpy("beauty").copy(),
+        "traced": lambda turn: traced.frame(turn).numpy("beauty").copy(),
         f"Mitsuba {mitsuba_peer.SCALAR}": peer,
     }
     taken = take_turns(works, 1 if quick else 2, device, keep=1, host=[f"Mitsuba {mitsuba_peer.SCALAR}"])

@@ -43,7 +43,7 @@ def jumps(scene: gi.Scene, textures: TransferTextures, seed: int = 0) -> Row:
         corners = atlas.corners[edge[:, 0, None], edge[:, 1:]].astype(np.float64)  # [edge, end, xy]
         points = corners[:, None, 0] * (1 - t)[:, None] + corners[:, None, 1] * t[:, None]
         sides.append(fetched(atlas, irradiance, np.repeat(edge[:, 0], POINTS), points.reshape(-1, 2)))
-    faces, inside = inner_points(atlas, rng, 20_000)
+    faces, inside = inner_points(atlas, is_smooth(scene), rng, 20_000)
     angles = rng.uniform(0, 2 * np.pi, len(faces))
     step = 0.5 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     a, b = fetched(atlas, irradiance, faces, inside - step / 2), fetched(atlas, irradiance, faces, inside + step / 2)
@@ -79,10 +79,19 @@ def seam_edges(scene: gi.Scene, atlas: Atlas) -> tuple[np.ndarray, np.ndarray]:
     return edges[pair], edges[pair + 1]
 
 
-def inner_points(atlas: Atlas, rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return faces, chosen by their texels, and points inside of them, float64 [count, 2]."""
+def is_smooth(scene: gi.Scene) -> np.ndarray:
+    """Return which faces have shading normals, as seams are looked for between those, bool [face]."""
+    geometry = scene.data("cpu").geometry
+    first = geometry.indices.numpy().reshape(-1, 3)[:, 0]
+    return np.asarray(np.linalg.norm(geometry.normals.numpy()[first], axis=1) > 0.5)
+
+
+def inner_points(
+    atlas: Atlas, chosen: np.ndarray, rng: np.random.Generator, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return faces of those ``chosen``, by their texels, and points inside of them, float64 [count, 2]."""
     edges = (atlas.corners[:, 1:] - atlas.corners[:, :1]).astype(np.float64)
-    areas = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]) * (atlas.charts >= 0)
+    areas = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]) * (chosen & (atlas.charts >= 0))
     faces = rng.choice(len(areas), count, p=areas / areas.sum())
     u, v = rng.random((2, count))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)

@@ -45,9 +45,7 @@ def vertex_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row
     return [{"table": TABLE, **row} for row in rows]
 
 
-def storage_row(
-    view: TermView, scene: gi.Scene, estimator: gi.RadianceTransfer, device: str
-) -> tuple[Row, np.ndarray]:
+def storage_row(view: TermView, scene: gi.Scene, estimator: gi.RadianceTransfer, device: str) -> tuple[Row, np.ndarray]:
     """Return errors, on the floor and in all, of a bake of ``scene``, which looks like that of the view."""
     bake = gi.bake(scene, estimator, device)
     frame = replace(view, scene=scene, _halves=view.halves).frame(estimator, 1, [bake])

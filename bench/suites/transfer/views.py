@@ -91,6 +91,8 @@ class TermView:
     device: str = "cpu"
     camera_samples: int = 1
     """Camera samples of a picture; 1 is in the middle of pixels."""
+    buffer: str = ""
+    """The frame's buffer that is a picture; that of the term if not given."""
     _halves: list[np.ndarray] = field(default_factory=list)
 
     def frame(self, estimator: Any, spp: int, bakes: Sequence[gi.Bake] = (), seed: int = SEED) -> gi.Frame:
@@ -101,7 +103,7 @@ class TermView:
 
     def picture(self, estimator: Any, spp: int, bakes: Sequence[gi.Bake] = (), seed: int = SEED) -> np.ndarray:
         """Return the term, float32 [height, width, 3]."""
-        return self.frame(estimator, spp, bakes, seed).numpy(self.term).copy()
+        return self.frame(estimator, spp, bakes, seed).numpy(self.buffer or self.term).copy()
 
     def traced(self, spp: int, seed: int) -> np.ndarray:
         """Return the path tracer's picture."""
