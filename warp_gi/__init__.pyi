@@ -54,6 +54,7 @@ from warp_gi.techniques.paths.estimators import BsdfPaths as BsdfPaths
 from warp_gi.techniques.paths.estimators import PowerLights as PowerLights
 from warp_gi.techniques.paths.estimators import TracedEnvironment as TracedEnvironment
 from warp_gi.techniques.paths.estimators import UniformLights as UniformLights
+from warp_gi.techniques.radiance_transfer.estimator import RadianceTransfer as RadianceTransfer
 from warp_gi.techniques.reuse.guided_paths import GuidedPaths as GuidedPaths
 from warp_gi.techniques.reuse.light_cache import VisibilityLightCache as VisibilityLightCache
 from warp_gi.techniques.reuse.pictures import reuse_pictures as reuse_pictures

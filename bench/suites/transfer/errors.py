@@ -1,4 +1,4 @@
-"""Errors of transfer against the path tracer: by resolution and bounce under a sky of 25 numbers, and under real ones."""
+"""Errors of transfer against the path tracer: by resolution and bounce under a smooth sky, and under real ones."""
 
 from __future__ import annotations
 

@@ -21,6 +21,7 @@ from warp_gi.bench.suites.transfer.shapes import STAND_INS, StandIn
 from warp_gi.bench.suites.transfer.views import BIG, SMALL, smooth_sky
 from warp_gi.kernels.transfer_products import LIGHT_WIDTH, vec6
 from warp_gi.launch import on_device
+from warp_gi.scene.baked import whole_scene
 from warp_gi.techniques.radiance_transfer import products
 from warp_gi.techniques.radiance_transfer.lobes import phong
 from warp_gi.techniques.radiance_transfer.textures import Atlas, transfer_textures
@@ -113,12 +114,13 @@ class Shader:
         self.frame, self.rows = stage.frame, stage.state.rows
         device = self.frame.device
         self.width, self.height = self.frame.camera.resolution
-        self.query = product_query(self.frame.scene.environment, form, device)
+        scene = whole_scene(self.frame.scene)
+        self.query = product_query(scene.environment or gi.Environment(), form, device)
         self.colors = wp.zeros(self.width * self.height, dtype=wp.vec3, device=device)
         atlas = transfer_textures(bake).atlas
         self.vertices = None
         if len(atlas.corner_slots):
-            self.vertices = vertex_places(self.frame.scene, atlas, self.frame.camera, device)
+            self.vertices = vertex_places(scene, atlas, self.frame.camera, device)
             self.at_vertices = wp.zeros(self.vertices.points.shape[0], dtype=wp.vec3, device=device)
 
     def __call__(self) -> None:

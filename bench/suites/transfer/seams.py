@@ -1,4 +1,4 @@
-"""Seams: how far light jumps where charts meet on a smooth surface, beside its change over half a texel inside a chart."""
+"""Seams: how far light jumps where charts meet on a smooth surface, beside its change over half a texel inside one."""
 
 from __future__ import annotations
 
@@ -37,21 +37,21 @@ def jumps(scene: gi.Scene, textures: TransferTextures, seed: int = 0) -> Row:
     irradiance = textures.transfer[:, :25].astype(np.float64) @ light.T
     rng, atlas = np.random.default_rng(seed), textures.atlas
     one, other = seam_edges(scene, atlas)
-    t = (np.arange(POINTS) + 0.5) / POINTS
-    sides = []
+    along = (np.arange(POINTS) + 0.5) / POINTS
+    t, sides = along[:, None], []
     for edge in (one, other):
         corners = atlas.corners[edge[:, 0, None], edge[:, 1:]].astype(np.float64)  # [edge, end, xy]
-        points = corners[:, None, 0] * (1 - t)[:, None] + corners[:, None, 1] * t[:, None]
+        points = corners[:, None, 0] * (1 - t) + corners[:, None, 1] * t
         sides.append(fetched(atlas, irradiance, np.repeat(edge[:, 0], POINTS), points.reshape(-1, 2)))
     faces, inside = inner_points(atlas, is_smooth(scene), rng, 20_000)
     angles = rng.uniform(0, 2 * np.pi, len(faces))
     step = 0.5 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    a, b = fetched(atlas, irradiance, faces, inside - step / 2), fetched(atlas, irradiance, faces, inside + step / 2)
-    a, b, kept = a[0], b[0], a[1] & b[1]
+    here, there = (fetched(atlas, irradiance, faces, inside + way * step / 2) for way in (-1, 1))
+    kept = here[1] & there[1]
     mean = float(irradiance[atlas.slot_sides == 0].mean())
     both = sides[0][1] & sides[1][1]
     jump = float(np.sqrt(np.mean((sides[0][0] - sides[1][0])[both] ** 2))) / mean
-    change = float(np.sqrt(np.mean((a - b)[kept] ** 2))) / mean
+    change = float(np.sqrt(np.mean((here[0] - there[0])[kept] ** 2))) / mean
     return {"seams": len(one), "jump": jump, "change over half a texel": change, "jump over change": jump / change}
 
 

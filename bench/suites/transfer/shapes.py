@@ -109,7 +109,7 @@ def head(
         points.append(np.tan(cube * np.pi / 4))
         column, row = k % 3, k // 3
         uv = np.stack([(across + 1) / 2, (along + 1) / 2], axis=1) * 0.96 + 0.02
-        uvs.append((uv + (column, row)) / (3, 2))
+        uvs.append((uv + np.array([column, row])) / (3, 2))
         faces.append(quads + k * len(across))
     directions = np.concatenate(points)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -153,7 +153,7 @@ def plants(leaves: int) -> gi.Scene:
     along = np.linspace(0, 1, segments + 1)
     points, uvs, faces = [], [], []
     strip = np.arange(segments)[:, None] * 2
-    quads = np.concatenate([strip + (0, 1, 3), strip + (0, 3, 2)])
+    quads = np.concatenate([strip + np.array(corners) for corners in ((0, 1, 3), (0, 3, 2))])
     for k in range(leaves):
         root = np.array([*(rng.integers(-3, 4, 2) * 0.7), 0.0])[[0, 2, 1]] + 0.06 * rng.normal(size=3) * (1, 0, 1)
         turn, length, bend, width = rng.uniform(0, 2 * np.pi), *rng.uniform((0.5, 0.4, 0.03), (1.2, 1.5, 0.07))

@@ -1,4 +1,4 @@
-"""What the parts of the suite ``transfer`` share: skies, pictures of one term, and errors without the noise of paths."""
+"""What the parts of the suite ``transfer`` share: skies, pictures of one term, and errors without the paths' noise."""
 
 from __future__ import annotations
 

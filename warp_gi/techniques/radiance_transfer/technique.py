@@ -24,4 +24,5 @@ TECHNIQUE = Technique(
     },
     bake_tool="bake_tool",
     samplers=("transfer_light.TRANSFER_CACHE",),
+    suite="transfer",
 )
