@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ GREY = 0.6
 """Albedo of the floor, the boxes and the ball of the court."""
 
 
-def court(environment: object = None, floor: int = 1, specular: float = 0.0, roughness: float = 1.0) -> gi.Scene:
+def court(environment: Any = None, floor: int = 1, specular: float = 0.0, roughness: float = 1.0) -> gi.Scene:
     """Return a court of 4 x 4 x 2 m: red, green and grey walls, two boxes and a ball on a grey floor.
 
     Args:

@@ -49,7 +49,7 @@ def bake_rows(quick: bool, device: str) -> list[Row]:
 
 def place_rows(name: str, scene: gi.Scene, quick: bool, device: str) -> list[Row]:
     """Return the rows of one scene."""
-    estimator = gi.RadianceTransfer(**({"resolution": 128} if quick else {}))
+    estimator = gi.RadianceTransfer(resolution=128) if quick else gi.RadianceTransfer()
     atlas = make_atlas(scene, estimator.transfer_settings, device)
     rows = [ray_row(name, scene, atlas, estimator, 1 << 11 if quick else SLOTS, device)]
     rows += error_rows(name, scene, atlas, estimator, *((300, 1024) if quick else (3000, REFERENCE_RAYS)), device)

@@ -41,7 +41,7 @@ class OneTerm:
     @staticmethod
     def of(scene: gi.Scene, camera: gi.Camera, estimator: Any, spp: int, device: str, bakes: list[gi.Bake]) -> OneTerm:
         """Return the estimator's; the first frame is drawn, which compiles."""
-        terms = dict.fromkeys(TERMS) | {"environment": estimator}
+        terms: dict[str, Any] = dict.fromkeys(TERMS) | {"environment": estimator}
         pipeline = gi.Pipeline(**terms, spp=spp, camera_samples=1)
         scheduler = gi.FrameScheduler(scene, camera, pipeline, device, bakes=bakes)
         drawn = scheduler.frame(0)
@@ -52,6 +52,7 @@ class OneTerm:
     def term(self, turn: int = 0) -> None:
         """Do the light once more."""
         estimator = self.scheduler.pipeline.environment
+        assert estimator is not None
         estimator.trace(self.drawn, self.scheduler.state("environment"))
         if self.drawn.paths.is_wanted:
             self.drawn.trace_paths()
@@ -126,8 +127,11 @@ def traced_rows(said: Row, every: Mapping[str, OneTerm], turns: int, device: str
 
 def added(a: Taken[None], b: Taken[None]) -> Taken[None]:
     """Return times of doing one after the other."""
-    pairs = [[x + y for x, y in zip(p, q, strict=True)] for p, q in ((a.wall, b.wall), (a.cpu, b.cpu))]
-    return Taken(*pairs, [x + y for x, y in zip(a.device, b.device, strict=True)])
+
+    def sums(x: list[float], y: list[float]) -> list[float]:
+        return [p + q for p, q in zip(x, y, strict=True)]
+
+    return Taken(sums(a.wall, b.wall), sums(a.cpu, b.cpu), sums(a.device, b.device))
 
 
 def large_row(said: Row, one: OneTerm, pixels: tuple[int, int], turns: int, device: str) -> Row:

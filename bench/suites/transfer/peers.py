@@ -7,6 +7,8 @@ faster where LLVM 19 is installed (suite ``dvf``).
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 import warp_gi as gi
@@ -51,7 +53,7 @@ def equal_error(name: str, scene: gi.Scene, camera: gi.Camera, quick: bool, devi
     view = TermView(scene, camera, "environment", 64 if quick else 512, device, 64, "beauty")
 
     def ours(used: object, samples: int) -> gi.FrameScheduler:
-        terms = dict.fromkeys(TERMS) | {"environment": used}
+        terms: dict[str, Any] = dict.fromkeys(TERMS) | {"environment": used}
         pipeline = gi.Pipeline(**terms, spp=samples)
         return gi.FrameScheduler(scene, camera, pipeline, device, bakes=[bake] if used is estimator else [])
 

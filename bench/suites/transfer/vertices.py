@@ -26,7 +26,7 @@ def vertex_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row
     size, spp = (QUICK_SIZE, 64) if quick else (SIZE, 1024)
     sky, camera = smooth_sky(), court_camera(size)
     view = TermView(court(sky), camera, "environment", spp, device)
-    rows, pictures = [], {}
+    rows, pictures = list[Row](), dict[str, np.ndarray]()
     for cells in QUICK_CELLS if quick else CELLS:
         scene, estimator = court(sky, floor=cells), replace(BASE, storage="vertices")
         row, pictures[f"vertices {cells}x{cells}"] = storage_row(view, scene, estimator, device)
@@ -37,9 +37,9 @@ def vertex_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row
             view, view.scene, replace(BASE, resolution=resolution), device
         )
         row |= {"storage": "texture", "size": str(resolution), "floor triangles": 2}
-        for cells, least in TARGETS.items():
-            row[f"times better than {cells}"] = floors[cells] / max(row["floor rel"], 1e-6)
-            row[f"target over {cells}"] = least if resolution == 256 else 0.0
+        for coarse, least in TARGETS.items():
+            row[f"times better than {coarse}"] = floors[coarse] / max(row["floor rel"], 1e-6)
+            row[f"target over {coarse}"] = least if resolution == 256 else 0.0
         rows.append(row)
     gallery.add(PictureSet("court: direct light of a smooth sky, vertices and textures", view.reference, pictures))
     return [{"table": TABLE, **row} for row in rows]

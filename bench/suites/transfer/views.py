@@ -97,7 +97,7 @@ class TermView:
 
     def frame(self, estimator: Any, spp: int, bakes: Sequence[gi.Bake] = (), seed: int = SEED) -> gi.Frame:
         """Return a frame with this term alone."""
-        terms = dict.fromkeys(TERMS) | {self.term: estimator}
+        terms: dict[str, Any] = dict.fromkeys(TERMS) | {self.term: estimator}
         pipeline = gi.Pipeline(**terms, spp=max(spp, self.camera_samples), camera_samples=self.camera_samples)
         return gi.FrameScheduler(self.scene, self.camera, pipeline, self.device, seed=seed, bakes=bakes).frame(0)
 
