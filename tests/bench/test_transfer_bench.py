@@ -128,10 +128,11 @@ def test_frames_are_measured_by_part():
 def test_errors_fall_with_bounces(monkeypatch):
     monkeypatch.setattr(errors, "QUICK_SIZE", (36, 24))
     monkeypatch.setattr(errors, "INDIRECT", gi.RadianceTransfer(term="indirect", **SMALL))
-    rows = assert_published(errors.BOUNCES, errors.bounce_rows(True, "cpu"))
+    view = errors.court_view("indirect", views.smooth_sky(), True, "cpu")
+    rows = assert_published(errors.BOUNCES, errors.bounce_rows(view, True, "cpu"))
     assert rows[0]["bias, %"] < -20 < rows[1]["bias, %"]
     assert rows[2]["bounces"].startswith("default, ")
-    rows = assert_published(errors.RESOLUTION, errors.resolution_rows(True, "cpu"))
+    rows = assert_published(errors.RESOLUTION, errors.resolution_rows(view, True, "cpu"))
     assert {row["term"] for row in rows} == {"environment", "indirect"}
 
 

@@ -42,15 +42,16 @@ INDIRECT = gi.RadianceTransfer(term="indirect", resolution=DENSE)
 def error_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
     """Return the rows of all tables."""
     rows: list[Row] = []
+    reflected = court_view("indirect", smooth_sky(), quick, device)
     for name, part in {RESOLUTION: resolution_rows, BOUNCES: bounce_rows, OTHER: other_rows}.items():
-        rows += attempt({"table": name}, partial(part, quick, device))
+        rows += attempt({"table": name}, partial(part, reflected, quick, device))
     rows += attempt({"table": SKIES}, partial(sky_rows, quick, device, gallery))
     return rows
 
 
 def court_view(term: str, sky: gi.Environment, quick: bool, device: str, camera_samples: int = 1) -> TermView:
     """Return the view of the Lambert court under a sky."""
-    spp = {"environment": 1024, "indirect": 512}[term]
+    spp = {"environment": 1024, "indirect": 256}[term]
     if camera_samples > 1:
         spp = 512
     size = QUICK_SIZE if quick else SIZE
@@ -68,10 +69,10 @@ def texels_a_metre(scene: gi.Scene, atlas: Atlas, name: str) -> float:
     return float(np.sqrt(texels / area))
 
 
-def resolution_rows(quick: bool, device: str) -> list[Row]:
-    """Return errors of both terms by texels a metre."""
+def resolution_rows(reflected: TermView, quick: bool, device: str) -> list[Row]:
+    """Return errors of both terms by texels a metre; ``reflected`` is the view of the court's indirect light."""
     sky, rows = smooth_sky(), list[Row]()
-    views = {term: court_view(term, sky, quick, device) for term in ("environment", "indirect")}
+    views = {"environment": court_view("environment", sky, quick, device), "indirect": reflected}
     for resolution in QUICK_RESOLUTIONS if quick else RESOLUTIONS:
         bake = gi.bake(court(sky), replace(INDIRECT, resolution=resolution), device)
         density = texels_a_metre(court(sky), transfer_textures(bake).atlas, "floor")
@@ -84,9 +85,9 @@ def resolution_rows(quick: bool, device: str) -> list[Row]:
     return sorted(rows, key=lambda row: row["term"])
 
 
-def bounce_rows(quick: bool, device: str) -> list[Row]:
+def bounce_rows(view: TermView, quick: bool, device: str) -> list[Row]:
     """Return errors of reflected light by the number of bounces, and of as many as the defaults take."""
-    view, rows = court_view("indirect", smooth_sky(), quick, device), list[Row]()
+    rows: list[Row] = []
     for bounces in (*(QUICK_BOUNCE_COUNTS if quick else BOUNCE_COUNTS), 0):
         estimator = replace(INDIRECT, bounces=bounces, tolerance=0.0) if bounces else INDIRECT
         bake = gi.bake(view.scene, estimator, device)
@@ -96,15 +97,15 @@ def bounce_rows(quick: bool, device: str) -> list[Row]:
     return rows
 
 
-def other_rows(quick: bool, device: str) -> list[Row]:
-    """Return errors of one bake, which holds no light, under several smooth skies."""
+def other_rows(reflected: TermView, quick: bool, device: str) -> list[Row]:
+    """Return errors of one bake, which holds no light, under several smooth skies; ``reflected`` is of the first."""
     rows: list[Row] = []
     bake = gi.bake(court(1.0), INDIRECT, device)
     for name in ("courtyard",) if quick else ("courtyard", "forest", "city"):
         if not quick and (why := sky_missing(name)):
             rows.append({"table": OTHER, "sky": name, "skipped": why})
             continue
-        view = court_view("indirect", smooth_sky(name), quick, device)
+        view = reflected if name == "courtyard" else court_view("indirect", smooth_sky(name), quick, device)
         row: Row = {"table": OTHER, "sky": name} | view.errors(view.picture(INDIRECT, 1, [bake]))
         rows.append(row | {"target bias, %": MOST_OTHER_BIAS})
     return rows

@@ -27,7 +27,7 @@ INTEGRATOR = {"type": "direct", "bsdf_samples": 1, "emitter_samples": 1}
 
 def peer_rows(quick: bool, device: str) -> list[Row]:
     """Return rows of the court and of Sponza, Lambert, under a smooth sky."""
-    size = (96, 64) if quick else (480, 270)
+    size = (96, 64) if quick else (320, 180)
     flat = peer_scene(court(smooth_sky()), diffuse=True)  # a material may not be on flat and smooth meshes in Mitsuba
     flat.environment = smooth_sky()
     rows = equal_error("court", flat, court_camera(size), quick, device)
