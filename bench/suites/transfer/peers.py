@@ -50,7 +50,7 @@ def equal_error(name: str, scene: gi.Scene, camera: gi.Camera, quick: bool, devi
         return [said | {"skipped": str(missing)}]
     estimator = gi.RadianceTransfer(bounces=0, resolution=256 if quick or name == "court" else 1024)
     bake = gi.bake(scene, estimator, device)
-    view = TermView(scene, camera, "environment", 64 if quick else 512, device, 64, "beauty")
+    view = TermView(scene, camera, "environment", 64 if quick else 256, device, 64, "beauty")
 
     def ours(used: object, samples: int) -> gi.FrameScheduler:
         terms: dict[str, Any] = dict.fromkeys(TERMS) | {"environment": used}
