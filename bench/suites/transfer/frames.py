@@ -88,9 +88,10 @@ def place_rows(name: str, scene: gi.Scene, camera: gi.Camera, quick: bool, devic
     rows: list[Row] = []
     small, large = (SMALL, (480, 272)) if quick else (BIG, BIGGER)
     base: dict[str, Any] = {"bounces": 0, "resolution": 128 if quick else 1024}
+    bake = None  # without bounces it holds nothing of materials, so one serves both
     for materials in ("own", "Lambert"):
         seen = under(peer_scene(scene, materials == "Lambert", flat=False, emission=False), sky)
-        bake = gi.bake(seen, gi.RadianceTransfer(**base), device)
+        bake = bake or gi.bake(seen, gi.RadianceTransfer(**base), device)
         view = camera.at_resolution(*small)
         every = {TRACED: OneTerm.of(seen, view, gi.TracedEnvironment(), SPP, device, [])}
         for way, settings in WAYS.items():
