@@ -71,6 +71,10 @@ TRANSFER_TURN_DIMENSION = wp.constant(1)  # turn of the slot's set about the nor
 TRANSFER_LAMP_DIMENSION = wp.constant(2)  # which lamp, and its further digits (random),
 TRANSFER_POINT_DIMENSION = wp.constant(3)  # and the point on it
 
+# Pixels lit by transfer textures, beside paths from there and from what their rays meet.
+TRANSFER_LOBE_DIMENSION = wp.constant(2004)  # the ray of a sharp lobe
+TRANSFER_SUN_DIMENSION = wp.constant(2005)  # the place on the discs of suns, by camera sample
+
 # Pixels lit by a visibility field.
 FIELD_BSDF_DIMENSION = wp.constant(101)  # the direction by the BSDF; random: which of these samples are verified
 FIELD_LIGHT_DIMENSION = wp.constant(102)  # which light samples are verified (random)

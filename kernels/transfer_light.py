@@ -13,9 +13,16 @@ from warp_gi.kernels.path_samplers import KnownRadiance, PathCache
 from warp_gi.kernels.sampling import circle, frame_of
 from warp_gi.kernels.surface import Surface, ray_origin, shading_normal
 from warp_gi.kernels.transfer_atlas import SlotFetch, TransferAtlas, atlas_fetch, side_seen
-from warp_gi.kernels.transfer_lobes import LobeTable, PrefilteredSky, lobe_at, table_place, unshaded_radiance
+from warp_gi.kernels.transfer_lobes import (
+    LobeTable,
+    PrefilteredSky,
+    lobe_at,
+    table_entry,
+    table_place,
+    unshaded_radiance,
+)
 from warp_gi.kernels.transfer_products import bounced_product, environment_product, glossy_product
-from warp_gi.kernels.types import Environment, SceneData
+from warp_gi.kernels.types import SceneData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -43,7 +50,7 @@ class TransferSky:
     lobes: LobeTable
     prefiltered: PrefilteredSky  # without suns
     scale: wp.float32  # of its radiance
-    rest: Environment  # the sky without suns, for rays of sharp lobes
+    environment_from_world: wp.mat33
     sun_count: wp.int32
     sun_directions: wp.array(dtype=wp.vec3)
     sun_irradiances: wp.array(dtype=wp.vec3)  # W/m^2 perpendicular to the direction
@@ -93,15 +100,16 @@ def diffuse_radiance(rows: TransferRows, sky: TransferSky, s: Surface, at: SlotF
     return wp.cw_mul(wp.cw_mul(diffuse_share(s.bsdf), s.bsdf.diffuse), irradiance) / wp.pi
 
 
-# Radiance of the sky, without suns, that the glossy lobe reflects towards the unit direction `view`: by transfer alone,
-# or (`ratio`) of the prefiltered sky the share that transfer says the occluders let through. The sky of 25 numbers may
-# come near 0 or below it where the real one does not, so that share is bounded, and so is what it divides by.
+# Radiance of the sky, without suns, that the glossy lobe reflects towards the unit direction `view`: by transfer alone
+# or, below a roughness, of the prefiltered sky the share that transfer says the occluders let through. The sky of 25
+# numbers may come near 0 or below it where the real one does not, so that share is bounded, and what it divides by.
 @wp.func
 def glossy_radiance(
-    rows: TransferRows, sky: TransferSky, ratio: wp.int32, s: Surface, at: SlotFetch, view: wp.vec3
+    rows: TransferRows, sky: TransferSky, ratio_below: wp.float32, s: Surface, at: SlotFetch, view: wp.vec3
 ) -> wp.vec3:
     normal = shading_normal(s)
-    place = table_place(sky.lobes, wp.sqrt(s.bsdf.alpha), wp.dot(normal, view))
+    roughness = wp.sqrt(s.bsdf.alpha)
+    place = table_place(sky.lobes, roughness, wp.dot(normal, view))
     lobe = lobe_at(sky.lobes, place, normal, view)
     products = glossy_product(
         rows.transfer,
@@ -115,14 +123,26 @@ def glossy_radiance(
         lobe.normal_factors,
     )
     light = wp.vec3(products[0], products[1], products[2])
-    if ratio != 0:
-        open = unshaded_radiance(sky.lobes, sky.prefiltered, sky.rest.environment_from_world, place, normal, view)
+    if roughness < ratio_below:
+        open = unshaded_radiance(sky.lobes, sky.prefiltered, sky.environment_from_world, place, normal, view)
         for c in range(3):
             least = LEAST_OF_MEAN * MEAN_OF_FIRST * sky.light[c * rows.width]
             share = wp.clamp(light[c] / wp.max(products[3 + c], wp.max(least, 1.0e-20)), 0.0, MOST_SHARE)
             light[c] = open[c] * sky.scale * share
     reflected = s.bsdf.f0 * lobe.scale + wp.vec3(1.0, 1.0, 1.0) * (s.bsdf.f90 * lobe.offset)
     return wp.cw_mul(reflected, light)
+
+
+# What a surface reflects of the same light from everywhere towards the unit direction `view`.
+@wp.func
+def view_reflectance(sky: TransferSky, s: Surface, view: wp.vec3) -> wp.vec3:
+    diffuse = wp.cw_mul(diffuse_share(s.bsdf), s.bsdf.diffuse)
+    if s.bsdf.f90 <= 0.0:
+        return diffuse
+    place = table_place(sky.lobes, wp.sqrt(s.bsdf.alpha), wp.dot(shading_normal(s), view))
+    scale = table_entry(sky.lobes.entries, place, 2)
+    offset = s.bsdf.f90 * table_entry(sky.lobes.entries, place, 3)
+    return diffuse + s.bsdf.f0 * scale + wp.vec3(offset, offset, offset)
 
 
 # Whether transfer is kept around a point.

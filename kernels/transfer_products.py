@@ -132,8 +132,8 @@ _BOUNCED = (
 )
 
 # A lobe, of factors lobe[l] about a direction and normal_lobe[l - 1] about the normal, times the light's matrix, and
-# that times T, blended: the triple product with fixed light. W_cj = sum_k M_ckj F_k comes first, so that the same W serves T and the transfer of a point that
-# nothing shades, lobe by lobe A_l y(n): results 0 to 2, and 3 to 5.
+# that times T, blended: the triple product with fixed light. W_cj = sum_k M_ckj F_k comes first, so that the same W
+# serves T and the transfer of a point that nothing shades, A_l y(n) by band: results 0 to 2, and 3 to 5.
 _GLOSSY = (
     "    wp::vec_t<6, float> result;\n"
     + _VECTORS

@@ -2,9 +2,8 @@
 
 import warp as wp
 
-from warp_gi.kernels.bsdf import average_reflectance
 from warp_gi.kernels.gbuffer import PassSettings, PrimaryHits, tiled_pixel
-from warp_gi.kernels.sampling import OWN_DIMENSION, pixel_sample_index, pixel_seed, sample_2d
+from warp_gi.kernels.sampling import TRANSFER_SUN_DIMENSION, pixel_sample_index, pixel_seed, sample_2d
 from warp_gi.kernels.surface import Surface, surface_at
 from warp_gi.kernels.transfer_atlas import SlotFetch
 from warp_gi.kernels.transfer_light import (
@@ -16,6 +15,7 @@ from warp_gi.kernels.transfer_light import (
     is_kept,
     sun_radiance,
     surface_slots,
+    view_reflectance,
 )
 from warp_gi.kernels.types import SceneData
 
@@ -23,7 +23,6 @@ wp.set_module_options({"enable_backward": False})
 
 WANTS_ENVIRONMENT = wp.constant(1)
 WANTS_INDIRECT = wp.constant(2)
-SUN_DIMENSION = wp.constant(OWN_DIMENSION + 1)  # by camera sample
 
 
 # What a launch is asked for.
@@ -31,7 +30,8 @@ SUN_DIMENSION = wp.constant(OWN_DIMENSION + 1)  # by camera sample
 class TransferQuery:
     terms: wp.int32  # WANTS_*
     traced_below: wp.float32  # roughness below which rays are traced for the glossy lobe
-    ratio: wp.int32  # 1: glossy light of the prefiltered sky, shaded by transfer; 0: by transfer alone
+    ratio_below: wp.float32  # roughness below which glossy light is the prefiltered sky's, shaded by transfer
+    sharp: wp.int32  # of a pixel, in transfer_trace.py: 1 if it is there for its glossy lobe alone
     soft: wp.int32  # 1: suns are discs, by one point of each a camera sample; 0: their middles
     traces: wp.int32  # 1: a launch of transfer_trace.py serves these pixels, and those where no transfer is kept
 
@@ -62,7 +62,7 @@ def sun_point(settings: PassSettings, p: wp.vec2i, soft: wp.int32) -> wp.vec2:
         return wp.vec2(0.0, 0.0)
     index = pixel_sample_index(p[0], p[1], settings.camera_sample, settings.camera_bits)
     seed = pixel_seed(p[0], p[1], settings.camera_bits, settings.seed)
-    return sample_2d(index, seed, SUN_DIMENSION)
+    return sample_2d(index, seed, TRANSFER_SUN_DIMENSION)
 
 
 # Adds radiance that stands for `count` equal samples.
@@ -109,7 +109,7 @@ def shade_transfer(
     if (query.terms & WANTS_ENVIRONMENT) != 0:
         light = diffuse_radiance(rows, sky, s, at)
         if s.bsdf.f90 > 0.0:
-            light = light + glossy_radiance(rows, sky, query.ratio, s, at, -direction)
+            light = light + glossy_radiance(rows, sky, query.ratio_below, s, at, -direction)
         light = wp.max(light, wp.vec3(0.0, 0.0, 0.0))
         if sky.sun_count > 0:
             u = sun_point(settings, p, query.soft)
@@ -117,5 +117,5 @@ def shade_transfer(
         b = buffers
         add_equal(b.environment, b.environment_moment1, b.environment_moment2, pixel, light, count)
     if (query.terms & WANTS_INDIRECT) != 0:
-        light = wp.cw_mul(average_reflectance(s.bsdf), bounced_irradiance(rows, sky, at)) / wp.pi
+        light = wp.cw_mul(view_reflectance(sky, s, -direction), bounced_irradiance(rows, sky, at)) / wp.pi
         add_equal(buffers.indirect, buffers.indirect_moment1, buffers.indirect_moment2, pixel, light, count)

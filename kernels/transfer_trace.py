@@ -8,7 +8,6 @@ import warp as wp
 
 from warp_gi.kernels.bsdf import average_reflectance, diffuse_share, lambert, specular_sample
 from warp_gi.kernels.bvh import BvhHit, bvh_intersect
-from warp_gi.kernels.environment import environment_radiance
 from warp_gi.kernels.gbuffer import PassSettings, PrimaryHits, tiled_pixel
 from warp_gi.kernels.path_samplers import ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY
 from warp_gi.kernels.path_trace import (
@@ -19,7 +18,7 @@ from warp_gi.kernels.path_trace import (
     PathSettings,
     path_tracer,
 )
-from warp_gi.kernels.sampling import OWN_DIMENSION, pixel_sample_index, pixel_seed, sample_2d
+from warp_gi.kernels.sampling import TRANSFER_LOBE_DIMENSION, pixel_sample_index, pixel_seed, sample_2d
 from warp_gi.kernels.surface import Surface, ray_origin, surface_at
 from warp_gi.kernels.transfer_atlas import SlotFetch
 from warp_gi.kernels.transfer_light import (
@@ -48,7 +47,6 @@ wp.set_module_options({"enable_backward": False})
 TRACER = path_tracer(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY, TRANSFER_CACHE)
 TransferSamplers = TRACER.samplers
 trace_path = TRACER.trace_path
-NARROW = wp.constant(wp.float32(0.03))  # alpha below which a lobe's rays look for suns themselves: it is about as wide
 
 UP = wp.constant(wp.vec3(0.0, 0.0, 1.0))
 NO_POINT = wp.constant(wp.vec2(0.0, 0.0))
@@ -93,7 +91,7 @@ def leaving_radiance(
     return light
 
 
-# What a ray of the glossy lobe brings.
+# Light over other surfaces that a ray of the glossy lobe brings.
 @wp.func
 def lobe_light(
     scene: SceneData,
@@ -103,38 +101,61 @@ def lobe_light(
     wo: wp.vec3,
     index: wp.uint32,
     seed: wp.uint32,
-) -> TracedLight:
-    r = TracedLight()
-    b = specular_sample(s.bsdf, wo, sample_2d(index, seed, OWN_DIMENSION))
+) -> wp.vec3:
+    b = specular_sample(s.bsdf, wo, sample_2d(index, seed, TRANSFER_LOBE_DIMENSION))
     if b.pdf <= 0.0:
-        return r
+        return wp.vec3(0.0, 0.0, 0.0)
     wi = s.shading * b.wi
     if wp.dot(wi, s.normal) <= 0.0:
-        return r
+        return wp.vec3(0.0, 0.0, 0.0)
     hit = bvh_intersect(scene.bvh, ray_origin(s), wi, float(wp.inf))
-    if hit.face >= 0:
-        r.indirect = wp.cw_mul(b.weight, leaving_radiance(scene, samplers, paths, hit, wi, index, seed))
-    elif samplers.cache.sky.sun_count > 0 and s.bsdf.alpha >= NARROW:
-        r.environment = wp.cw_mul(b.weight, environment_radiance(samplers.cache.sky.rest, wi))
-    else:
-        r.environment = wp.cw_mul(b.weight, environment_radiance(scene.environment, wi))
-    return r
+    if hit.face < 0:
+        return wp.vec3(0.0, 0.0, 0.0)
+    return wp.cw_mul(b.weight, leaving_radiance(scene, samplers, paths, hit, wi, index, seed))
 
 
-# Light of a sharp surface that needs no ray of its lobe: of its diffuse lobe, and of suns.
+# Light of a sharp surface's diffuse lobe, which needs no ray but to suns.
 @wp.func
-def known_light(
-    scene: SceneData, cache: TransferCache, s: Surface, at: SlotFetch, wo: wp.vec3, u: wp.vec2
-) -> TracedLight:
+def diffuse_light(scene: SceneData, cache: TransferCache, s: Surface, at: SlotFetch, u: wp.vec2) -> TracedLight:
     r = TracedLight()
     r.environment = wp.max(diffuse_radiance(cache.rows, cache.sky, s, at), wp.vec3(0.0, 0.0, 0.0))
     diffuse = wp.cw_mul(diffuse_share(s.bsdf), s.bsdf.diffuse)
     if cache.sky.sun_count > 0:
-        b = s.bsdf
-        if b.alpha < NARROW:
-            b = lambert(diffuse)
-        r.environment = r.environment + sun_radiance(scene, cache.sky, s, b, wo, u)
+        r.environment = r.environment + sun_radiance(scene, cache.sky, s, lambert(diffuse), UP, u)
     r.indirect = wp.cw_mul(diffuse, bounced_irradiance(cache.rows, cache.sky, at)) / wp.pi
+    return r
+
+
+# One sample of a pixel where rays are traced. The glossy lobe's own light from the sky is that of a path of one bounce
+# on a surface without the diffuse lobe: sky samples and directions of the lobe share it.
+@wp.func
+def traced_light(
+    scene: SceneData,
+    samplers: TransferSamplers,
+    paths: PathSettings,
+    query: TransferQuery,
+    hit: BvhHit,
+    s: Surface,
+    view: wp.vec3,
+    index: wp.uint32,
+    seed: wp.uint32,
+) -> TracedLight:
+    r = TracedLight()
+    if query.sharp == 0:
+        path = trace_path(scene, samplers, hit, s, view, paths, index, seed, NO_PATH)
+        r.environment = path.environment
+        r.indirect = path.indirect
+        return r
+    if (query.terms & WANTS_ENVIRONMENT) != 0:
+        lobe = s
+        lobe.bsdf.diffuse = wp.vec3(0.0, 0.0, 0.0)
+        lobe.base_color = wp.vec3(0.0, 0.0, 0.0)
+        direct = paths
+        direct.terms = TERM_ENVIRONMENT
+        path = trace_path(scene, samplers, hit, lobe, view, direct, index, seed, NO_PATH)
+        r.environment = path.environment
+    if (query.terms & WANTS_INDIRECT) != 0:
+        r.indirect = lobe_light(scene, samplers, paths, s, wp.transpose(s.shading) * view, index, seed)
     return r
 
 
@@ -165,22 +186,19 @@ def trace_transfer(
     at = surface_slots(samplers.cache.rows, scene, s, hit.face, hit.u, hit.v)
     if not is_traced(query, s, at):
         return
-    wo = wp.transpose(s.shading) * view
-    known = known_light(scene, samplers.cache, s, at, wo, sun_point(settings, p, query.soft))
+    known = TracedLight()
+    wanted = query
+    wanted.sharp = int(is_kept(at))
+    if wanted.sharp != 0:
+        known = diffuse_light(scene, samplers.cache, s, at, sun_point(settings, p, query.soft))
     seed = pixel_seed(p[0], p[1], settings.sample_bits, settings.seed)
+    b = buffers
     for i in range(settings.sample_count):
         index = pixel_sample_index(p[0], p[1], settings.first_sample + i, settings.sample_bits)
-        light = TracedLight()
-        if is_kept(at):
-            light = lobe_light(scene, samplers, paths, s, wo, index, seed)
-            light.environment = light.environment + known.environment
-            light.indirect = light.indirect + known.indirect
-        else:
-            path = trace_path(scene, samplers, hit, s, view, paths, index, seed, NO_PATH)
-            light.environment = path.environment
-            light.indirect = path.indirect
-        b = buffers
+        light = traced_light(scene, samplers, paths, wanted, hit, s, view, index, seed)
         if (query.terms & WANTS_ENVIRONMENT) != 0:
-            add_equal(b.environment, b.environment_moment1, b.environment_moment2, pixel, light.environment, 1.0)
+            sum = known.environment + light.environment
+            add_equal(b.environment, b.environment_moment1, b.environment_moment2, pixel, sum, 1.0)
         if (query.terms & WANTS_INDIRECT) != 0:
-            add_equal(b.indirect, b.indirect_moment1, b.indirect_moment2, pixel, light.indirect, 1.0)
+            sum = known.indirect + light.indirect
+            add_equal(b.indirect, b.indirect_moment1, b.indirect_moment2, pixel, sum, 1.0)

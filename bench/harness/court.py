@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
 import warp_gi as gi
 from warp_gi.bench.harness.scenes import quad, sphere
 from warp_gi.scene import harmonics
+from warp_gi.scene.environment import Sky
 
 GREY = 0.6
 """Albedo of the floor, the boxes and the ball of the court."""
 
 
-def court(environment: Any = None, floor: int = 1, specular: float = 0.0, roughness: float = 1.0) -> gi.Scene:
+def court(environment: Sky = None, floor: int = 1, specular: float = 0.0, roughness: float = 1.0) -> gi.Scene:
     """Return a court of 4 x 4 x 2 m: red, green and grey walls, two boxes and a ball on a grey floor.
 
     Args:

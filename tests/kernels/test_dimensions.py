@@ -94,6 +94,13 @@ def test_probes_draw_beside_their_paths():
         assert (kind, dimension) not in paths
 
 
+def test_transfer_draws_beside_its_paths():
+    """The path of a sharp lobe's light from the sky, and the one from what its ray meets, have the ray's index."""
+    paths = path_numbers(BsdfPaths().max_depth - 1)
+    drawn = [(STRATIFIED, d.TRANSFER_LOBE_DIMENSION), (STRATIFIED, d.TRANSFER_SUN_DIMENSION)]
+    assert len(set(drawn)) == 2 and not paths.keys() & set(drawn)
+
+
 def test_paths_that_measure_reach_do_not_meet():
     used = {d.CAMERA_DIMENSION}
     for vertex in range(16):

@@ -200,7 +200,9 @@ def picture_of_files(path, light, frame):
 def test_files_alone_make_the_renderers_own_frame(tmp_path):
     """Rays against the triangles of the glTF file, numbers from EXR and JSON: pixel by pixel what is rendered."""
     scene, path = plain_court(), tmp_path / "court.exr"
-    settings = gi.RadianceTransfer(resolution=64, rays=64, bounce_rays=16, bounces=4, tolerance=0.0, sun=0.0)
+    settings = gi.RadianceTransfer(
+        resolution=64, first_rays=64, rays=64, bounce_rays=16, bounces=4, tolerance=0.0, sun=0.0
+    )
     bake = gi.bake(scene, settings)
     pipeline = gi.Pipeline(environment=settings, indirect=replace(settings, term="indirect"), emitters=None, spp=1)
     frame = next(gi.render(scene, CAMERA, pipeline, bakes=[bake]))

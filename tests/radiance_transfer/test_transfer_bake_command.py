@@ -40,7 +40,7 @@ def test_a_bake_is_saved_exported_shown_and_told(tmp_path, capsys, monkeypatch):
     assert rows["charts"] > 5 and rows["bytes a slot"] == 2 * (25 + 75) + lamps
     for word in ("charts", "slots of backs", "rays a slot", "share of the last", "seconds by stage", "bytes a slot"):
         assert word in told
-    assert "more than the tolerance of 0.002: give more --bounces than 2" in told
+    assert "more than the tolerance of 0.0005: give more --bounces than 2" in told
     file = read_export("a/box.json")
     assert file.info["components"]["count"] == 5 and file.images[0, 0, "bounces"].shape[2] == 5
     assert json.loads((tmp_path / "a" / "box.json").read_text())["bake"] == bake.digest

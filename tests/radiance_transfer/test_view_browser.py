@@ -91,7 +91,7 @@ def opened(browser, path, address="", size=SIZE):
 @pytest.mark.parametrize("turn", [0, 90])
 def test_the_picture_is_that_of_the_renderer(browser, written, scene, bake, turn):
     expected = rendered(scene, bake, turn)
-    with opened(browser, written, f"#bare=1&turn={turn}") as page:
+    with opened(browser, written, f"#bare=1&exposure=0&turn={turn}") as page:
         page.wait_for_selector(READY, timeout=60000)
         picture = seen(page)
     assert picture.shape == expected.shape and expected.std() > 20
@@ -112,7 +112,7 @@ def test_harmonics_turn_as_in_the_library(browser, written, scene):
 
 def test_what_moves_it(browser, written):
     """Right button and keys turn the sky, the left button and the wheel the view; R leads back."""
-    with opened(browser, written, "#bare=1&turn=10") as page:
+    with opened(browser, written, "#bare=1&exposure=0&turn=10") as page:
         page.wait_for_selector(READY, timeout=60000)
         state = lambda: page.evaluate("[viewer.state.turn, viewer.view.yaw, viewer.view.distance]")  # noqa: E731
         first, start = seen(page), state()
@@ -158,6 +158,28 @@ def test_the_panel(browser, written):
         right = [one[:, 350:].astype(int) for one in pictures]
         assert all(np.abs(a - b).mean() > 1 for a, b in itertools.pairwise(right))
         assert right[2].mean() > right[1].mean() and right[4].mean() < right[3].mean()
+
+
+def test_exposure_suits_the_view(browser, scene, bake, written, tmp_path):
+    """In a scene 64 times as dark the page shows nearly the same, 6 stops up; a number that is given is kept."""
+    dark = scene.environment
+    dark = gi.Environment(pixels=dark.pixels, rotation=dark.rotation, scale=1 / 64)
+    path = write_view(bake, gi.Scene(scene.nodes, environment=dark), CAMERA, tmp_path / "dark.html")
+    stops = []
+    for one in (written, path):
+        with opened(browser, one, "#bounces=0") as page:
+            page.wait_for_selector(READY, timeout=60000)
+            stops.append(page.evaluate("viewer.state.exposure"))
+            middle = np.median(seen(page).mean(axis=2))
+            assert 70 < middle < 150
+            page.evaluate("viewer.set({ exposure: 3 })")
+            page.keyboard.press("e")
+            assert page.evaluate("viewer.state.exposure") == stops[-1]
+    assert 4 < stops[1] - stops[0] <= 6.1
+    write_view(bake, scene, CAMERA, path, exposure=-1.5)
+    with opened(browser, path) as page:
+        page.wait_for_selector(READY, timeout=60000)
+        assert page.evaluate("viewer.state.exposure") == -1.5
 
 
 def test_a_narrow_window_shows_all_of_the_view(browser, written):

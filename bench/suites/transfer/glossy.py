@@ -25,7 +25,7 @@ BASE = gi.RadianceTransfer(resolution=DENSE, bounces=0, glossy="transfer", trace
 WAYS: dict[str, dict[str, Any]] = {
     "ratio": {"glossy": "ratio"},
     "transfer": {"glossy": "transfer"},
-    "transfer, no window": {"glossy": "transfer", "window": 0.0},
+    "transfer, window 0.005": {"glossy": "transfer", "window": 0.005},
 }
 
 

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import warp as wp
 
+from warp_gi import launch
 from warp_gi.kernels.transfer_bake import SKY
+from warp_gi.kernels.transfer_bounces import spread_reach
 from warp_gi.techniques.radiance_transfer.rays import TracedTransfer
 from warp_gi.techniques.radiance_transfer.textures import Atlas
 
@@ -35,7 +38,9 @@ def off_edges(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     return (weights / weights.sum(axis=1, keepdims=True))[:, 1:].astype(np.float32)
 
 
-def without_buried(atlas: Atlas, traced: TracedTransfer, lit: np.ndarray | None = None) -> TracedTransfer:
+def without_buried(
+    atlas: Atlas, traced: TracedTransfer, lit: np.ndarray | None = None, device: wp.Device | None = None
+) -> TracedTransfer:
     """Return what was traced, with that of the nearest slot in the open in place of that of slots inside objects.
 
     A floor's texels below a box are black, and bilinear fetches beside the box read them. No light gets there, over
@@ -45,10 +50,11 @@ def without_buried(atlas: Atlas, traced: TracedTransfer, lit: np.ndarray | None 
         atlas: Where the slots are.
         traced: What their rays find.
         lit: Slots that lamps shine on, bool [slots]; None without lamps.
+        device: Where kernels run; None is the CPU.
     """
     if atlas.corners.shape[0] == 0 or traced.hits.shape[1] == 0:
         return traced
-    buried = ~reached_slots(traced.hits, lit)
+    buried = ~reached_slots(traced.hits, lit, device)
     if not buried.any():
         return traced
     stands_in = _stand_ins(atlas, buried)
@@ -57,18 +63,26 @@ def without_buried(atlas: Atlas, traced: TracedTransfer, lit: np.ndarray | None 
     return replace(traced, transfer=traced.transfer[stands_in], hits=hits)
 
 
-def reached_slots(hits: np.ndarray, lit: np.ndarray | None = None) -> np.ndarray:
+def reached_slots(hits: np.ndarray, lit: np.ndarray | None = None, device: wp.Device | None = None) -> np.ndarray:
     """Return the slots that light gets to, bool [slots]: that see the sky, are lit, or see enough of such slots."""
+    target = device or launch.get_device("cpu")
     reached = (hits == SKY).any(axis=1)
     if lit is not None:
         reached |= lit
-    while True:
-        dark = np.flatnonzero(~reached)
-        there = hits[dark]
-        found = ((there >= 0) & reached[np.maximum(there, 0)]).mean(axis=1) > REACHED
-        if not found.any():
-            return reached
-        reached[dark[found]] = True
+    needed = int(REACHED * hits.shape[1]) + 1
+    rows = launch.on_device(hits, wp.int32, target)
+    dark = np.flatnonzero(~reached).astype(np.int32)
+    while len(dark):
+        known = launch.on_device(reached.astype(np.uint8), wp.uint8, target)
+        found = wp.zeros(len(dark), dtype=wp.uint8, device=target)
+        inputs = [launch.on_device(dark, wp.int32, target), rows, known, needed, found]
+        launch.launch(spread_reach, len(dark), inputs, target)
+        more = found.numpy() > 0
+        if not more.any():
+            break
+        reached[dark[more]] = True
+        dark = dark[~more]
+    return reached
 
 
 def _stand_ins(atlas: Atlas, buried: np.ndarray) -> np.ndarray:

@@ -45,7 +45,7 @@ class RadianceTransfer(Estimator, RadianceCache):
     Source: Sirikonda et al., "Precomputed Radiance Transfer Textures" (prt_textures.txt).
     """
 
-    term: str = "environment"
+    term: str = "environment"  # type: ignore[misc]  # a field: one class serves two terms
     """Term of the light: "environment" is direct light from the sky, "indirect" light that was reflected before."""
     storage: Literal["texture", "vertices"] = "texture"
     """Where transfer is kept: in texels of an atlas ("texture"), or at the vertices of meshes ("vertices"), as a
@@ -80,12 +80,14 @@ class RadianceTransfer(Estimator, RadianceCache):
     """Whether suns are discs, with soft shadows by a ray from each camera sample to another point; else points, with
     hard shadows."""
     glossy: Literal["auto", "ratio", "transfer", "traced"] = "auto"
-    """How glossy lobes are lit: "ratio" by the sky prefiltered for the lobe, of which transfer says how much occluders
-    let through; "transfer" by transfer alone, as in the paper; "traced" by rays; "auto" by the ratio down to a
-    roughness of ``traced_below``, and by rays below."""
+    """How glossy lobes are lit: "transfer" by transfer alone, as in the paper; "ratio" by the sky prefiltered for the
+    lobe, of which transfer says how much occluders let through; "traced" by rays; "auto" by transfer down to a
+    roughness of ``ratio_below``, by the ratio down to ``traced_below``, and by rays below."""
+    ratio_below: float = 0.55
+    """Roughness below which the ratio serves glossy lobes: above, the sky's 25 numbers are the smaller error."""
     traced_below: float = 0.45
     """Roughness below which rays are traced for the glossy lobe, one for each of the pipeline's samples."""
-    window: float = 0.005
+    window: float = 0.0
     """Strength of the window on the light of glossy lobes, against ringing: bands l are divided by
     1 + window l^2 (l + 1)^2."""
 
@@ -114,7 +116,7 @@ class RadianceTransfer(Estimator, RadianceCache):
                 raise OptionError(f"{name} must be a whole number from {low} to {high}, got {value!r}")
         if self.rays < self.first_rays:
             raise OptionError(f"rays must be at least first_rays ({self.first_rays}), got {self.rays}")
-        for name in ("chart_seconds", "tolerance", "sun", "traced_below", "window"):
+        for name in ("chart_seconds", "tolerance", "sun", "ratio_below", "traced_below", "window"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise OptionError(f"{name} must be finite and not negative, got {value}")
@@ -184,7 +186,7 @@ class RadianceTransfer(Estimator, RadianceCache):
             for order, moment in enumerate(frame.moments(one.term), 1):
                 setattr(buffers, f"{one.term}_moment{order}", moment)
         query.traced_below = {"ratio": 0.0, "transfer": 0.0, "traced": 2.0}.get(self.glossy, self.traced_below)
-        query.ratio = int(self.glossy != "transfer")
+        query.ratio_below = {"ratio": 2.0, "transfer": 0.0}.get(self.glossy, self.ratio_below)
         query.soft = int(self.soft_suns)
         query.traces = int(_needs_rays(frame.scene, query.traced_below))
         sky = self._sky(frame)

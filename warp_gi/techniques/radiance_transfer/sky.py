@@ -92,7 +92,8 @@ class TransferLight(Service):
         result.whole_light = on_device(_padded(environment.harmonics_of(LIGHT_ORDER), LIGHT_WIDTH), wp.float32, device)
         result.matrix = on_device(rows.reshape(-1), wp.float32, device)
         result.lobes = lobes_on_device(order, device.alias)
-        result.rest, result.scale = rest.data(device), rest.scale
+        result.environment_from_world = wp.mat33(*rest.world_from_environment.T.ravel())
+        result.scale = rest.scale
         maps = prefiltered(rest)
         result.prefiltered.texels = maps.on(device)
         result.prefiltered.levels, result.prefiltered.rows = maps.levels.shape[:2]

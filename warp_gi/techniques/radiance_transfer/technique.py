@@ -3,6 +3,7 @@
 from warp_gi.registry import Claim, Entry, Technique
 
 _SETTINGS = {"resolution": 256}
+_RESOLUTION = {least: tuple({"resolution": size} for size in (least, 64, 256)) for least in (16, 32)}
 
 TECHNIQUE = Technique(
     name="radiance-transfer",
@@ -11,8 +12,10 @@ TECHNIQUE = Technique(
         "RadianceTransfer": Entry(
             "estimator",
             {
-                "": Claim(_SETTINGS, unbiased=False, bound=0.05),
-                "indirect": Claim({**_SETTINGS, "term": "indirect"}, unbiased=False, bound=0.05),
+                "": Claim(_SETTINGS, unbiased=False, bound=0.05, resolution=_RESOLUTION[16]),
+                "indirect": Claim(
+                    {**_SETTINGS, "term": "indirect"}, unbiased=False, bound=0.05, resolution=_RESOLUTION[32]
+                ),
             },
         )
     },

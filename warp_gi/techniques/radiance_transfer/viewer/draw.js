@@ -1,6 +1,7 @@
 // Draws the scene into half floats with several samples a pixel, and then through the tone curve into the canvas.
 const DIRECT_LAYERS = 7;
 const SAMPLES = 8;
+const BACK_OFFSET = 64; // last bits of depth: where a front and a back share an edge, samples on it are the front's
 const WRAPS = { repeat: "REPEAT", clamp: "CLAMP_TO_EDGE", mirror: "MIRRORED_REPEAT" };
 
 class Drawing {
@@ -158,6 +159,22 @@ class Drawing {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
+  // Exposure in stops that makes the upper quartile of luminances in the last picture a light grey; black is left out.
+  suitedExposure() {
+    const { gl, canvas } = this;
+    const pixels = new Float32Array(4 * canvas.width * canvas.height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.resolved);
+    gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.FLOAT, pixels);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    const lit = [];
+    for (let i = 0; i < pixels.length; i += 4) {
+      const luminance = 0.2126 * pixels[i] + 0.7152 * pixels[i + 1] + 0.0722 * pixels[i + 2];
+      if (luminance > 1e-6) lit.push(luminance);
+    }
+    const quartile = Float32Array.from(lit).sort()[(3 * lit.length) >> 2];
+    return quartile ? Math.round(10 * Math.log2(0.35 / quartile)) / 10 : 0;
+  }
+
   use(program, vertices, textures) {
     const { gl } = this;
     gl.useProgram(program.made);
@@ -182,15 +199,18 @@ class Drawing {
     const { uniforms } = this.surface;
     gl.enable(gl.DEPTH_TEST);
     gl.enable(gl.CULL_FACE);
+    gl.polygonOffset(0, BACK_OFFSET);
     this.use(this.surface, this.vertices, []);
     ["transfer", "colorImage", "emissionImage"].forEach((name, unit) => gl.uniform1i(uniforms[name], unit));
     gl.uniformMatrix4fv(uniforms.clipFromWorld, false, view.clipFromWorld);
     gl.uniform4fv(uniforms.weights, view.weights);
     gl.uniform1f(uniforms.bounced, view.bounced ? 1 : 0);
     for (const group of about.groups) {
+      gl.disable(gl.POLYGON_OFFSET_FILL);
       const material = about.materials[group.material];
       const emits = group.side === 0 || material.doubleSided;
       gl.cullFace(group.side === 0 ? gl.BACK : gl.FRONT);
+      if (group.side === 1) gl.enable(gl.POLYGON_OFFSET_FILL);
       this.use(this.surface, this.vertices, [
         [gl.TEXTURE_2D_ARRAY, this.pages[group.page][group.side]],
         [gl.TEXTURE_2D, this.images[material.image] ?? this.white],
@@ -201,6 +221,7 @@ class Drawing {
       gl.uniform2f(uniforms.coverage, material.alpha, material.cutoff);
       gl.drawElements(gl.TRIANGLES, 3 * group.count, gl.UNSIGNED_INT, 12 * group.first);
     }
+    gl.disable(gl.POLYGON_OFFSET_FILL);
     gl.disable(gl.CULL_FACE);
     gl.disable(gl.DEPTH_TEST);
   }

@@ -70,7 +70,7 @@ def write_view(
     path: str | Path,
     sky: Environment | None = None,
     largest_mb: float = LARGEST_MB,
-    exposure: float = 0.0,
+    exposure: float | None = None,
 ) -> Path:
     """Write a page that shows a bake under skies that turn; the file appears whole or not at all.
 
@@ -85,7 +85,7 @@ def write_view(
         path: Name of the file, ``.html``.
         sky: The first sky; None is the scene's own. Some made ones can be chosen in the page, as bright as it.
         largest_mb: Largest size of the page in MB (1e6 bytes).
-        exposure: Exposure at the start, in stops.
+        exposure: Exposure at the start, in stops; None suits the first view.
 
     Returns the path. Raises OptionError for another suffix, a bake at vertices, or what does not fit however small;
     BakeError for a bake of another technique or scene, OSError for a path that cannot be written.
@@ -93,7 +93,7 @@ def write_view(
     path = check_view_name(path)
     if not (math.isfinite(largest_mb) and largest_mb > 0):
         raise OptionError(f"largest_mb must be finite and above 0, got {largest_mb}")
-    if not math.isfinite(exposure):
+    if exposure is not None and not math.isfinite(exposure):
         raise OptionError(f"exposure must be a finite number of stops, got {exposure}")
     textures = transfer_textures(bake)
     _check(textures, scene)
@@ -181,7 +181,8 @@ def _notes(scene: Scene, shown: Surfaces, rows: Rows) -> list[str]:
     """Return what the page does not show, or not exactly."""
     notes = []
     if shown.left_out:
-        notes.append(f"{shown.left_out:,} triangles are left out: they move, or nothing is kept for them.")
+        count = f"{shown.left_out:,} of {scene.triangle_count:,}"
+        notes.append(f"Left out are {count} triangles: they move, or nothing is kept there.")
     if len(rows.components):
         notes.append(
             f"{len(rows.components)} numbers stand for the 75 of bounces, error {rows.error:.2g} of their mean."

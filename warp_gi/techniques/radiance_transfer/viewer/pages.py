@@ -18,6 +18,8 @@ COMPONENTS = 24
 FINE, COARSE = 1024, 256
 """Steps to which numbers are rounded, as parts of their RMS: a step of 1 / 1024, or where a page would be too large of
 1 / 256. Errors are a step / sqrt 12."""
+_BOUNCES = 0.25
+"""Fineness of the components of bounces beside that of T: the others that are left out are a larger error."""
 _LARGEST = 32000
 """Steps from 0 to the largest number at most, to fit int16."""
 
@@ -76,12 +78,13 @@ def steps_of(rows: Rows, fineness: int) -> np.ndarray:
     """
     steps = np.ones(rows.values.shape[1], np.float32)
     lamps, bounces = LIGHT_NUMBERS, 4 * DIRECT_LAYERS
-    for first, end in ((0, lamps), *((lamps + c, lamps + c + 1) for c in range(3)), (bounces, len(steps))):
+    kinds = [(0, lamps, 1.0), *((lamps + c, lamps + c + 1, 1.0) for c in range(3)), (bounces, len(steps), _BOUNCES)]
+    for first, end, share in kinds:
         if first == end:
             continue
         rms = math.sqrt(np.mean(rows.values[:, first].astype(np.float64) ** 2))
         largest = float(np.abs(rows.values[:, first:end]).max(initial=0))
-        steps[first:end] = max(rms / fineness, largest / _LARGEST, 1e-20)
+        steps[first:end] = max(rms / (share * fineness), largest / _LARGEST, 1e-20)
     return steps
 
 

@@ -1,6 +1,7 @@
 // The view and the sky, and what turns them: mouse, fingers, keys, the panel, and the address (#turn=90&sky=1&...).
 const MOST_TILT = (89 * Math.PI) / 180;
 const STEP = 5; // degrees of a key
+const MOST_STOPS = 16;
 const MOST_RATIO = 2; // pixels of the canvas for one of the page
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -80,7 +81,7 @@ class Viewer {
     this.about = about;
     this.canvas = document.getElementById("view");
     this.view = new View(about.camera, about.bounds);
-    this.state = { sky: 0, turn: 0, exposure: about.exposure, bounces: true };
+    this.state = { sky: 0, turn: 0, exposure: about.exposure ?? 0, bounces: true };
     this.pointers = new Map();
   }
 
@@ -91,6 +92,7 @@ class Viewer {
     this.readAddress();
     this.listen();
     this.render();
+    if (this.about.exposure === null && !new URLSearchParams(location.hash.slice(1)).has("exposure")) this.suit();
     document.getElementById("message").textContent = "";
     document.documentElement.dataset.ready = "";
   }
@@ -135,15 +137,20 @@ class Viewer {
       const slider = document.getElementById(name);
       slider.addEventListener("input", () => this.set({ [name]: Number(slider.value) }));
     }
+    document.getElementById("suit").addEventListener("click", () => this.suit());
     const bounces = document.getElementById("bounces");
     bounces.addEventListener("change", () => this.set({ bounces: bounces.checked }));
+  }
+
+  suit() {
+    this.set({ exposure: this.drawing.suitedExposure() });
   }
 
   set(values) {
     Object.assign(this.state, values);
     const { state } = this;
     state.turn -= 360 * Math.round(state.turn / 360);
-    state.exposure = Math.min(16, Math.max(-16, state.exposure));
+    state.exposure = Math.min(MOST_STOPS, Math.max(-MOST_STOPS, state.exposure));
     document.getElementById("sky").value = state.sky;
     document.getElementById("turn").value = state.turn;
     document.getElementById("turn-value").textContent = `${state.turn.toFixed(0)}\u00b0`;
@@ -166,7 +173,7 @@ class Viewer {
     this.view.orbit(number("yaw", 0), number("pitch", 0));
     this.set({
       turn: number("turn", 0),
-      exposure: number("exposure", this.about.exposure),
+      exposure: number("exposure", this.about.exposure ?? this.state.exposure),
       sky: Math.min(this.about.skies.length - 1, Math.max(0, Math.round(number("sky", state.sky)))),
       bounces: number("bounces", 1) !== 0,
     });
@@ -238,6 +245,7 @@ class Viewer {
       "+": () => view.zoom(1 / 1.1),
       "=": () => view.zoom(1 / 1.1),
       "-": () => view.zoom(1.1),
+      e: () => this.suit(),
       r: () => this.readAddress(),
       h: () => document.body.classList.toggle("bare"),
     };
