@@ -84,7 +84,7 @@ def frame_rows(quick: bool, device: str) -> list[Row]:
 
 def place_rows(name: str, scene: gi.Scene, camera: gi.Camera, quick: bool, device: str) -> list[Row]:
     """Return the rows of one scene under the courtyard's sky: beside tracing, and in a large picture."""
-    sky, turns = true_sky("courtyard"), 1 if quick else 2
+    sky, turns = true_sky("courtyard"), 1 if quick else 3
     rows: list[Row] = []
     small, large = (SMALL, (480, 272)) if quick else (BIG, BIGGER)
     base: dict[str, Any] = {"bounces": 0, "resolution": 128 if quick else 1024}
@@ -113,7 +113,9 @@ def traced_rows(said: Row, every: Mapping[str, OneTerm], turns: int, device: str
     parts: dict[str, dict[str, Taken[None]]] = {}
     for part in ("term", "primary", "frame"):
         works: dict[str, Callable[[int], None]] = {way: getattr(one, part) for way, one in every.items()}
-        parts[part] = take_turns(works, turns, device, warm=False)
+        once = take_turns({TRACED: works.pop(TRACED)}, 1, device, warm=False)[TRACED]
+        again = Taken[None](once.wall * turns, once.cpu * turns, once.device * turns)  # it takes long, so it is steady
+        parts[part] = {TRACED: again, **take_turns(works, turns, device, warm=False)}
     with_primary = {way: added(parts["term"][way], parts["primary"][way]) for way in every}
     rows: list[Row] = []
     for way in every:
