@@ -93,7 +93,7 @@ def error_rows(
     some = of_slots(atlas, np.sort(rng.choice(atlas.count, min(count, atlas.count), replace=False)))
 
     def traced(seed: int, **settings: Any) -> tuple[np.ndarray, float]:
-        wanted = replace(estimator, **settings).transfer_settings
+        wanted = replace(estimator.transfer_settings, **settings)  # more rays than the estimator would take
         found = trace_slots(transfer_work(scene, some, wanted, launch.get_device(device), seed))
         return found.transfer.astype(np.float64), float(found.rays.mean())
 
