@@ -28,4 +28,5 @@ TECHNIQUE = Technique(
     bake_tool="bake_tool",
     page="techniques/radiance_transfer.md",
     samplers=("transfer_light.TRANSFER_CACHE",),
+    suite="transfer",
 )
