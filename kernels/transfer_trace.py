@@ -71,23 +71,24 @@ def leaving_radiance(
     seed: wp.uint32,
 ) -> wp.vec3:
     s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
-    wanted = paths
     at = surface_slots(samplers.cache.rows, scene, s, hit.face, hit.u, hit.v)
+    wanted = paths
+    wanted.terms = TERM_EMITTERS
     if not is_kept(at):
         wanted.terms = TERM_ENVIRONMENT | TERM_EMITTERS | TERM_INDIRECT
+    light = wp.vec3(0.0, 0.0, 0.0)
+    if scene.emitters.count > 0 or not is_kept(at):
         r = trace_path(scene, samplers, hit, s, -direction, wanted, index, seed, NO_PATH)
-        return r.environment + r.emitters + r.indirect
+        light = r.environment + r.emitters + r.indirect
+    if not is_kept(at):
+        return light
     sky = samplers.cache.sky
     rows = samplers.cache.rows
     irradiance = wp.max(environment_product(rows.transfer, rows.width, at.slots, at.shares, sky.light), wp.vec3())
     irradiance = irradiance + bounced_irradiance(rows, sky, at)
-    light = wp.cw_mul(average_reflectance(s.bsdf), irradiance) / wp.pi
+    light = light + wp.cw_mul(average_reflectance(s.bsdf), irradiance) / wp.pi
     if sky.sun_count > 0:
         light = light + sun_radiance(scene, sky, s, lambert(average_reflectance(s.bsdf)), UP, NO_POINT)
-    if scene.emitters.count > 0:
-        wanted.terms = TERM_EMITTERS
-        r = trace_path(scene, samplers, hit, s, -direction, wanted, index, seed, NO_PATH)
-        light = light + r.emitters
     return light
 
 
@@ -141,20 +142,17 @@ def traced_light(
     seed: wp.uint32,
 ) -> TracedLight:
     r = TracedLight()
-    if query.sharp == 0:
-        path = trace_path(scene, samplers, hit, s, view, paths, index, seed, NO_PATH)
+    start = s
+    wanted = paths
+    if query.sharp != 0:
+        start.bsdf.diffuse = wp.vec3(0.0, 0.0, 0.0)
+        start.base_color = wp.vec3(0.0, 0.0, 0.0)
+        wanted.terms = TERM_ENVIRONMENT
+    if query.sharp == 0 or (query.terms & WANTS_ENVIRONMENT) != 0:
+        path = trace_path(scene, samplers, hit, start, view, wanted, index, seed, NO_PATH)
         r.environment = path.environment
         r.indirect = path.indirect
-        return r
-    if (query.terms & WANTS_ENVIRONMENT) != 0:
-        lobe = s
-        lobe.bsdf.diffuse = wp.vec3(0.0, 0.0, 0.0)
-        lobe.base_color = wp.vec3(0.0, 0.0, 0.0)
-        direct = paths
-        direct.terms = TERM_ENVIRONMENT
-        path = trace_path(scene, samplers, hit, lobe, view, direct, index, seed, NO_PATH)
-        r.environment = path.environment
-    if (query.terms & WANTS_INDIRECT) != 0:
+    if query.sharp != 0 and (query.terms & WANTS_INDIRECT) != 0:
         r.indirect = lobe_light(scene, samplers, paths, s, wp.transpose(s.shading) * view, index, seed)
     return r
 
