@@ -144,7 +144,7 @@ _FRAME = Region(
                 GridColumn("with primary rays", _less("with primary", "TPFL")),
                 GridColumn("whole frame", _less("frame", "TPFL")),
                 GridColumn("sun apart: term", Figure("term: times less, cpu", {"way": "TPFL and sun"})),
-                GridColumn("defaults: term", Figure("term: times less, cpu", {"way": "ratio and sun"})),
+                GridColumn("sun apart, ratio form: term", Figure("term: times less, cpu", {"way": "ratio and sun"})),
                 GridColumn("Lambert: term", Figure("term: times less, cpu", {"way": "diffuse"})),
                 GridColumn("TPFL at 1920x1080, ms", Figure("term cpu ms", {"way": "TPFL"}, table="frames: 1920x1080")),
             ),
