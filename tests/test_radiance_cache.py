@@ -66,7 +66,7 @@ def test_the_command_line_names_a_cache_and_its_settings(tmp_path, capsys):
     assert metadata["pipeline.indirect.ends_in"] == "LightFieldProbes"
     assert metadata["pipeline.indirect.ends_in.resolution"] == 16
     for pipeline, told in {
-        "path,indirect.ends_in=PowerLights": "unknown radiance cache 'PowerLights' (known: LightFieldProbes)",
+        "path,indirect.ends_in=PowerLights": "unknown radiance cache 'PowerLights' (known: LightFieldProbes, Radiance",
         "direct,indirect.ends_in=LightFieldProbes": "got indirect=none",
         "path,emitters.ends_in=LightFieldProbes": "got emitters=PowerLights",
         "path,indirect.ends=LightFieldProbes": "did you mean 'indirect.ends_in'",
