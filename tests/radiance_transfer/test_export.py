@@ -22,6 +22,7 @@ from warp_gi.techniques.radiance_transfer import export
 from warp_gi.techniques.radiance_transfer.gltf_export import drawn_triangles
 from warp_gi.techniques.radiance_transfer.textures import Atlas, TransferTextures
 from warp_gi.techniques.radiance_transfer.transfer_file import read_export
+from warp_gi.techniques.radiance_transfer.vertices import vertex_atlas
 from warp_gi.techniques.shared.exr_parts import read_exr_parts
 
 LIGHT = np.random.default_rng(3).normal(size=(3, 25)).astype(np.float32)
@@ -389,8 +390,9 @@ def test_what_cannot_be_exported_is_one_line(scene, tmp_path):
     none = TransferTextures(textures.atlas, textures.transfer, textures.bounces[:0], textures.lamps)
     with pytest.raises(OptionError, match="no bounces to compress"):
         export.export_textures(bake_of(none, scene), tmp_path / "a.exr", scene, components=4)
-    vertices = Atlas(**{**vars(textures.atlas), "pages": np.zeros((0, 3), np.int32)})
-    at_vertices = TransferTextures(vertices, textures.transfer, textures.bounces, textures.lamps)
+    vertices = vertex_atlas(scene)
+    transfer = np.zeros((vertices.count, 25), np.float16)
+    at_vertices = TransferTextures(vertices, transfer, textures.bounces[:0], np.zeros((0, 3), np.float32))
     with pytest.raises(OptionError, match="transfer at vertices has no images"):
         export.export_textures(bake_of(at_vertices, scene), tmp_path / "a.exr", scene)
     with pytest.raises(OSError):
@@ -446,3 +448,11 @@ for size in {[size * 9 // 10 for size in sizes]}:
     assert len(lines) == 8 and "written" not in lines, result
     assert {file.name: file.read_bytes() for file in (tmp_path / "old").iterdir()} == before
     assert list((tmp_path / "new").iterdir()) == []
+
+
+def test_no_file_of_another_is_overwritten(tmp_path):
+    """hall.exr would write hall.glb, which may be the scene."""
+    (tmp_path / "hall.glb").write_bytes(b"a scene")
+    with pytest.raises(gi.OptionError, match=r"hall\.glb exists and is not of an earlier export"):
+        export.check_export_name(tmp_path / "hall.exr")
+    export.check_export_name(tmp_path / "other.exr")

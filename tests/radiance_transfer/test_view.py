@@ -20,6 +20,7 @@ from warp_gi.cli import main as cli
 from warp_gi.errors import BakeError, OptionError
 from warp_gi.techniques.radiance_transfer.pca import expand_bounces
 from warp_gi.techniques.radiance_transfer.textures import TransferTextures
+from warp_gi.techniques.radiance_transfer.vertices import vertex_atlas
 from warp_gi.techniques.radiance_transfer.viewer import pages, skies
 from warp_gi.techniques.radiance_transfer.viewer.page import write_view
 
@@ -270,8 +271,9 @@ def test_coarser_texels_are_means(scene, textures):
 def test_mistakes(scene, textures, tmp_path):
     path, bake = tmp_path / "a.html", bake_of(textures, scene)
     cut = Bake(bake.technique, bake.scene_key, {}, {**bake.arrays, "transfer": bake.arrays["transfer"][:-1]})
-    corners = np.zeros((2, 3, 3), np.int32)
-    vertices = Bake(bake.technique, bake.scene_key, {}, {**bake.arrays, "atlas_corner_slots": corners})
+    atlas = vertex_atlas(scene)
+    none = np.zeros((0, 3, 25), np.float16), np.zeros((0, 3), np.float32)
+    vertices = bake_of(TransferTextures(atlas, np.zeros((atlas.count, 25), np.float16), *none), scene)
     other = gi.Scene([gi.Node("floor", [scene.nodes[0].meshes[0]])])
     cases = [
         (lambda: write_view(bake, scene, CAMERA, tmp_path / "a.htm"), OptionError, "a view is one .html file"),
@@ -279,7 +281,7 @@ def test_mistakes(scene, textures, tmp_path):
         (lambda: write_view(bake, scene, CAMERA, path, exposure=np.inf), OptionError, "exposure must be a finite"),
         (lambda: write_view(bake_of(textures, scene, "Other"), scene, CAMERA, path), BakeError, "got one of Other"),
         (lambda: write_view(bake, other, CAMERA, path), BakeError, "with 2 triangles, got one of "),
-        (lambda: write_view(cut, scene, CAMERA, path), BakeError, "rows of transfer, one a slot, got "),
+        (lambda: write_view(cut, scene, CAMERA, path), BakeError, "does not hold transfer textures that fit together"),
         (lambda: write_view(vertices, scene, CAMERA, path), OptionError, "this bake is at vertices"),
     ]
     for call, kind, words in cases:

@@ -28,7 +28,7 @@ class StandIn:
     """The size of the quick form; 0 leaves the scene out."""
     eye: tuple[float, float, float]
     target: tuple[float, float, float]
-    paper_triangles: str
+    paper_triangles: int
     paper_fps: tuple[float, float, float, float]
     """Frames a second at 1920x1080 on an RTX 3090 (Table 1): at vertices TP and TPFL, by textures TP and TPFL."""
     paper_vertex_mb: float
@@ -178,9 +178,11 @@ def plants(leaves: int) -> gi.Scene:
 
 
 STAND_INS = (
-    StandIn("dragon", dragon, 1, 0, (1.2, 1.4, 2.6), (0, 0.6, 0), "1.3M", (3.62, 41.2, 5.2, 151.2), 215.8, (DRAGON,)),
-    StandIn("TRM", heads, 111, 12, (0.4, 1.8, 3.6), (0, 0.6, 0), "441K", (10.2, 116.2, 15.2, 202.9), 139.3),
-    StandIn("room", room, 42, 8, (1.8, 2.2, 2.6), (-0.3, 0.6, -0.6), "21K", (352.3, 2432.7, 83.6, 568.2), 2.5),
-    StandIn("plants", plants, 1500, 60, (1.6, 1.6, 3.2), (0, 0.4, 0), "18K", (363.2, 2597.6, 6.7, 168.3), 2.5),
+    StandIn(
+        "dragon", dragon, 1, 0, (1.2, 1.4, 2.6), (0, 0.6, 0), 1_300_000, (3.62, 41.2, 5.2, 151.2), 215.8, (DRAGON,)
+    ),
+    StandIn("TRM", heads, 111, 12, (0.4, 1.8, 3.6), (0, 0.6, 0), 441_000, (10.2, 116.2, 15.2, 202.9), 139.3),
+    StandIn("room", room, 42, 8, (1.8, 2.2, 2.6), (-0.3, 0.6, -0.6), 21_000, (352.3, 2432.7, 83.6, 568.2), 2.5),
+    StandIn("plants", plants, 1500, 60, (1.6, 1.6, 3.2), (0, 0.4, 0), 18_000, (363.2, 2597.6, 6.7, 168.3), 2.5),
 )
 """The scenes of the paper's tables, in its order."""

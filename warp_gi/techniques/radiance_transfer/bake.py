@@ -119,6 +119,7 @@ def bake_transfer(
     target = get_device(device)
     stages = _Stages(progress)
     with scene.lock:
+        scene.check_unchanged()
         _check_motion(scene)
         with stages.run("charts") as told:
             vertices = settings.storage == "vertices"
@@ -148,6 +149,7 @@ def regather(scene: Scene, settings: TransferSettings, bake: Bake, device: str, 
     if "hits" not in bake.arrays:
         raise BakeError("this bake has no hits to gather from again: bake it again, with keep_hits")
     with scene.lock:
+        scene.check_unchanged()
         if not np.array_equal(_hits_key(scene), bake.arrays["hits_key"]):
             raise BakeError("this bake is of other geometry or normals, so its hits do not hold: bake it again")
         bake.check(TECHNIQUE, bake.scene_key, settings.stored())

@@ -16,6 +16,8 @@ import numpy as np
 
 from warp_gi.errors import OptionError
 
+SHARE = "share"
+"""First word of a line of the worker that tells the share that is done."""
 WORKER = Path(__file__).with_name("chart_worker.py")
 """The program."""
 
@@ -69,8 +71,9 @@ def _worked_off(folder: Path, seconds: float, progress: Progress | None) -> tupl
         try:
             with _clock(process, seconds) as is_late:
                 for line in process.stdout or ():
-                    if progress is not None:
-                        progress(float(line))
+                    words = line.split()
+                    if progress is not None and len(words) == 2 and words[0] == SHARE:  # xatlas may print others
+                        progress(float(words[1]))
                 code = process.wait()
         except BaseException:
             process.kill()

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import xatlas
 
+SHARE = "share"  # first word of a line that tells one, as in chart_job.py
 CUT_TEXELS = 4.0
 """Texels along a side, by the root of the triangles' number, of the page on which xatlas lays out the charts of a part.
 Their true size is found afterwards, by ``charts.surface_scales``."""
@@ -128,7 +129,7 @@ def main(folder: Path, seconds: float) -> None:
         signal.signal(signal.SIGPROF, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_PROF, seconds)
     with np.load(folder / "job.npz") as job:
-        result = run(dict(job), lambda share: print(share, flush=True))
+        result = run(dict(job), lambda share: print(SHARE, share, flush=True))
     result["seconds"] = np.array(time.process_time())
     np.savez(folder / "result.npz", **result)  # type: ignore[arg-type]
 

@@ -257,9 +257,13 @@ def transfer_cache(state: TransferState, sky: transfer_light.TransferSky) -> tra
 
 def _needs_rays(scene: Scene | BakedScene, traced_below: float) -> bool:
     """Return whether something moves, or a surface may be sharper than ``traced_below``."""
-    sharp = (one.roughness < traced_below or one.metallic_roughness_texture for one in whole_scene(scene).materials)
-    shiny = (one.specular > 0 or one.metallic > 0 for one in whole_scene(scene).materials)
-    return scene.is_animated or any(a and b for a, b in zip(sharp, shiny, strict=True))
+    if scene.is_animated or traced_below <= 0:
+        return scene.is_animated
+    return any(
+        (one.specular > 0 or one.metallic > 0)
+        and (one.roughness < traced_below or one.metallic_roughness_texture is not None)
+        for one in whole_scene(scene).materials
+    )
 
 
 @dataclass(frozen=True)

@@ -107,9 +107,23 @@ def channel_names(prefix: str, count: int) -> tuple[str, ...]:
 
 
 def check_export_name(path: str | Path) -> None:
-    """Raise OptionError unless ``path`` names an .exr file."""
-    if Path(path).suffix.lower() != ".exr":
-        raise OptionError(f"cannot write {Path(path).name}: transfer textures are .exr files; give NAME.exr")
+    """Raise OptionError unless ``path`` names an .exr file, beside which no file of another's would be overwritten.
+
+    An export of hall.exr also writes hall.glb, which may be the scene; over an earlier export it may write.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".exr":
+        raise OptionError(f"cannot write {path.name}: transfer textures are .exr files; give NAME.exr")
+    description = path.with_suffix(".json")
+    try:
+        is_ours = json.loads(description.read_text())["format"] == FORMAT if description.is_file() else False
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        is_ours = False
+    for file in (path.with_suffix(".glb"), description):
+        if file.exists() and not is_ours:
+            raise OptionError(
+                f"{file} exists and is not of an earlier export, which would overwrite it: give another name"
+            )
 
 
 def page_images(

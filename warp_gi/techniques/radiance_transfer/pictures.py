@@ -15,6 +15,7 @@ from warp_gi.scene.camera import Camera
 from warp_gi.scene.scene import Scene
 from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence.preview import magma, tone_map, write_pngs
+from warp_gi.techniques.radiance_transfer.bounces import lamps_move
 from warp_gi.techniques.radiance_transfer.estimator import RadianceTransfer
 from warp_gi.techniques.radiance_transfer.export import SIDES
 from warp_gi.techniques.radiance_transfer.textures import TransferTextures, transfer_textures
@@ -109,7 +110,9 @@ def draw_view(
     scene: Scene, camera: Camera, bake: Bake, settings: RadianceTransfer, device: str, seed: int
 ) -> np.ndarray:
     """Return the light of the sky in a view, by transfer alone, uint8 [height, width, 3]."""
-    environment, indirect = (replace(settings, term=term) for term in ("environment", "indirect"))
+    environment = replace(settings, term="environment")
+    bounces = settings.bounces > 0 and not lamps_move(scene)
+    indirect = replace(settings, term="indirect") if bounces else None
     pipeline = Pipeline(environment=environment, indirect=indirect, emitters=None, spp=4)
     frame = FrameScheduler(scene, camera, pipeline, device, seed, bakes=[bake]).frame(0)
     return tone_map(frame.numpy("beauty"), exposure_of(frame.numpy("beauty")))

@@ -109,7 +109,7 @@ def read_export(path: str | Path) -> TransferFile:
         info = json.loads(path.read_text())
         is_ours = info["format"] == FORMAT
         version = int(info["version"]) if is_ours else 0
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
         is_ours, version = False, 0
     if not is_ours:
         raise BakeError(f"{path}: does not describe {FORMAT}; give the .json file of an export")
