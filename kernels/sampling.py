@@ -70,6 +70,7 @@ TRANSFER_DIRECTION_DIMENSION = wp.constant(0)
 TRANSFER_TURN_DIMENSION = wp.constant(1)  # turn of the slot's set about the normal (random)
 TRANSFER_LAMP_DIMENSION = wp.constant(2)  # which lamp, and its further digits (random),
 TRANSFER_POINT_DIMENSION = wp.constant(3)  # and the point on it
+TRANSFER_RAY_DIMENSION = wp.constant(4)  # ray that may find a lamp
 
 # Pixels lit by transfer textures, beside paths from there and from what their rays meet.
 TRANSFER_LOBE_DIMENSION = wp.constant(2004)  # the ray of a sharp lobe

@@ -8,13 +8,15 @@ import warp as wp
 
 from warp_gi.kernels.alias import alias_choice
 from warp_gi.kernels.bvh import bvh_intersect, bvh_occluded
-from warp_gi.kernels.emitters import LightChoice, sample_emitter
+from warp_gi.kernels.emitters import LightChoice, may_hit_emitter, sample_emitter, triangle_light_pdf
 from warp_gi.kernels.light_connections import SHADOW_END
 from warp_gi.kernels.sampling import (
     TRANSFER_DIRECTION_DIMENSION,
     TRANSFER_LAMP_DIMENSION,
     TRANSFER_POINT_DIMENSION,
+    TRANSFER_RAY_DIMENSION,
     TRANSFER_TURN_DIMENSION,
+    balance,
     circle,
     cosine_direction,
     hash_uint,
@@ -22,10 +24,10 @@ from warp_gi.kernels.sampling import (
     sample_1d,
     sample_2d,
 )
-from warp_gi.kernels.surface import Surface, ray_origin, shading_normal, surface_shape
+from warp_gi.kernels.surface import Surface, ray_origin, shading_normal, surface_emission, surface_shape
 from warp_gi.kernels.transfer_atlas import BACK, TransferAtlas, atlas_nearest, side_seen
 from warp_gi.kernels.transfer_native import BLOCK_RAYS, Numbers, bit_count, harmonic_sums, open_transfer
-from warp_gi.kernels.types import SceneData
+from warp_gi.kernels.types import Bvh, SceneData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -204,6 +206,8 @@ class LampSamples:
     count: wp.int32
     each: wp.int32  # 1: a sample is the emitter of its number; 0: emitters are drawn by power
     seed: wp.uint32
+    bvh: Bvh  # of what rests
+    faces: wp.array(dtype=wp.int32)  # [face of the tree] face of the scene; empty where they are the same
 
 
 # Sample k of a slot.
@@ -215,11 +219,31 @@ def lamp_choice(scene: SceneData, lamps: LampSamples, index: wp.uint32, k: wp.in
         digits = random_1d(index, lamps.seed, TRANSFER_LAMP_DIMENSION)
         a = alias_choice(scene.emitters.alias, scene.emitters.count, u, digits)
         choice.item = a.item
-        choice.pdf = a.pdf * wp.float32(lamps.count)
+        choice.pdf = a.pdf
     return choice
 
 
-# Thread: a slot, from slot `start` on. Irradiance by the scene's emitters.
+# What a ray of cosine density, in `direction`, brings of the emissive surface that it hits, over that density; balanced
+# against a light sample. Close to a lamp such rays find it as often as it is large, where points on it vary without end.
+@wp.func
+def lamp_by_ray(
+    scene: SceneData, lamps: LampSamples, origin: wp.vec3, direction: wp.vec3, cosine: wp.float32
+) -> wp.vec3:
+    if cosine <= 0.0 or not may_hit_emitter(scene.emitters, origin, direction):
+        return wp.vec3()
+    hit = bvh_intersect(lamps.bvh, origin, direction, float(wp.inf))
+    face = hit.face
+    if face >= 0 and lamps.faces.shape[0] > 0:
+        face = lamps.faces[face]
+    if face < 0 or scene.geometry.emitters[face] < 0:
+        return wp.vec3()
+    pdf = triangle_light_pdf(scene, face, direction, hit.t) * scene.emitters.alias[scene.geometry.emitters[face]].pdf
+    light = surface_emission(scene, face, hit.u, hit.v, -direction)
+    return light * (wp.pi * balance(cosine / wp.pi, pdf))
+
+
+# Thread: a slot, from slot `start` on. Irradiance by the scene's emitters: of each of them where all have no size, else
+# of light samples and rays. `scene` has all that moves, and its tree numbers faces as the emitters do.
 @wp.kernel
 def light_slots(
     first: wp.int32,
@@ -240,8 +264,15 @@ def light_slots(
         e = sample_emitter(scene, origin, choice, sample_2d(index, lamps.seed, TRANSFER_POINT_DIMENSION))
         cosine = wp.dot(e.direction, n)
         if e.pdf > 0.0 and cosine > 0.0 and wp.dot(e.direction, s.normal) > 0.0:
-            if bvh_occluded(scene.bvh, origin, e.direction, e.distance * SHADOW_END) == 0:
+            if bvh_occluded(lamps.bvh, origin, e.direction, e.distance * SHADOW_END) == 0:
                 if e.delta == 0:
-                    cosine = cosine / e.pdf
+                    cosine = cosine / e.pdf * balance(e.pdf, cosine / wp.pi)
                 sum += e.radiance * cosine
+        if lamps.each == 0:
+            local = cosine_direction(sample_2d(index, lamps.seed, TRANSFER_RAY_DIMENSION))
+            direction = s.shading * local
+            if wp.dot(direction, s.normal) > 0.0:
+                sum += lamp_by_ray(scene, lamps, origin, direction, local[2])
+    if lamps.each == 0:
+        sum = sum / wp.float32(lamps.count)
     result[slot] = sum

@@ -136,6 +136,7 @@ def test_paths_that_measure_reach_do_not_meet():
             (STRATIFIED, d.TRANSFER_LAMP_DIMENSION),
             (RANDOM, d.TRANSFER_LAMP_DIMENSION),
             (STRATIFIED, d.TRANSFER_POINT_DIMENSION),
+            (STRATIFIED, d.TRANSFER_RAY_DIMENSION),
         ],
     ],
     ids=["visibility bake", "sets", "visibility field", "transfer bake"],

@@ -14,6 +14,7 @@ from warp_gi import launch
 from warp_gi.errors import OptionError
 from warp_gi.scene.harmonics import basis
 from warp_gi.techniques.radiance_transfer import bounces as baking
+from warp_gi.techniques.radiance_transfer.atlas import make_atlas
 from warp_gi.techniques.radiance_transfer.rays import trace_slots, transfer_work
 
 WHITE = np.sqrt(4 * np.pi)  # the first coefficient of a sky of radiance 1; the others are 0
@@ -177,6 +178,24 @@ def test_lamps_in_a_closed_sphere(kind):
     gathered = baking.gather_light(work, traced, reflectance, found, 100, 1e-6)
     assert inside(scene, np.sum(gathered, axis=0)) == pytest.approx(direct * ALBEDO / (1 - ALBEDO), rel=0.03)
     assert len(baking.gather_light(work, traced, reflectance, found, 3, 1e-6)) == 3
+
+
+def test_a_lamp_close_by_lights_no_slot_beyond_what_it_can():
+    """A floor 1 mm below a lamp of radiance 1: points on the lamp alone vary without bound, and so would all bounces."""
+    floor = quad((0, 0, 0), (0, 0, 1), (1, 0, 0), lambert((0.5, 0.5, 0.5)))
+    lamp = quad((0, 0.001, 0), (1, 0, 0), (0, 0, 1), lambert((0, 0, 0), emission=(1.0, 1.0, 1.0), double_sided=False))
+    cover = quad((0, 5, 0), (1, 0, 0), (0, 0, 1))
+    keys = [gi.Keyframe(0.0, (0.0, 0.0, 0.0)), gi.Keyframe(1.0, (0.0, 1.0, 0.0))]
+    nodes = [gi.Node("floor", [floor]), gi.Node("lamp", [lamp])]
+    for moves in (False, True):
+        scene = gi.Scene([*([gi.Node("cover", [cover], keyframes=keys)] if moves else []), *nodes])
+        atlas = make_atlas(scene, transfer_settings(resolution=64), "cpu")
+        work = transfer_work(scene, atlas, transfer_settings(), launch.get_device("cpu"), 0)
+        found = baking.lamp_irradiance(work, scene, 0)[:, 0]
+        on_floor = (atlas.slot_faces < 2 + 2 * moves) & (atlas.slot_faces >= 2 * moves) & (atlas.slot_sides == 0)
+        assert np.count_nonzero(on_floor) > 100
+        assert np.median(found[on_floor]) == pytest.approx(np.pi, rel=0.02)
+        assert found.max() < 1.2 * np.pi
 
 
 def test_texture_of_a_surface_is_averaged_over_its_texel():

@@ -12,6 +12,7 @@ from warp_gi.errors import OptionError
 from warp_gi.kernels import transfer_bake as ray_kernels
 from warp_gi.kernels import transfer_bounces as kernels
 from warp_gi.kernels import transfer_native as native
+from warp_gi.kernels import types
 from warp_gi.launch import on_device
 from warp_gi.scene.scene import Scene
 from warp_gi.techniques.radiance_transfer.rays import Progress, TracedTransfer, TransferWork, filled
@@ -88,11 +89,12 @@ def lamps_move(scene: Scene) -> bool:
 def lamp_irradiance(work: TransferWork, scene: Scene, seed: int, progress: Progress | None = None) -> np.ndarray:
     """Return the irradiance [W/m^2] by light that comes straight from the scene's emitters, float32 [slots, 3].
 
-    Emitters are chosen by power, and a point on them by area. So it is noisy close to a large one, and of use
-    only in means over many slots, as bounces are.
+    Emitters are chosen by power, and a point on them by area; beside each such sample is a ray of cosine density, as
+    points on a lamp close by vary without bound.
     """
-    data, lamps = work.data, ray_kernels.LampSamples()
+    data, lamps = launch.copied(scene.data(work.device), types.SceneData), ray_kernels.LampSamples()
     data.emitters.alias = scene.light_table(work.device)
+    lamps.bvh, lamps.faces = work.data.bvh, work.rays.faces
     lamps.each = int(scene.emitter_count == len(scene.lights) <= LAMP_SAMPLES)
     lamps.count = scene.emitter_count if lamps.each else LAMP_SAMPLES
     lamps.seed = seed & 0xFFFFFFFF
