@@ -223,8 +223,8 @@ def lamp_choice(scene: SceneData, lamps: LampSamples, index: wp.uint32, k: wp.in
     return choice
 
 
-# What a ray of cosine density, in `direction`, brings of the emissive surface that it hits, over that density; balanced
-# against a light sample. Close to a lamp such rays find it as often as it is large, where points on it vary without end.
+# What a ray of cosine density brings of the emissive surface that it hits, over that density and balanced against a
+# light sample. Close to a lamp, points on it vary without bound, and such rays do not.
 @wp.func
 def lamp_by_ray(
     scene: SceneData, lamps: LampSamples, origin: wp.vec3, direction: wp.vec3, cosine: wp.float32

@@ -181,7 +181,7 @@ def test_lamps_in_a_closed_sphere(kind):
 
 
 def test_a_lamp_close_by_lights_no_slot_beyond_what_it_can():
-    """A floor 1 mm below a lamp of radiance 1: points on the lamp alone vary without bound, and so would all bounces."""
+    """A floor 1 mm below a lamp of radiance 1: samples of the lamp vary without bound, and so would all bounces."""
     floor = quad((0, 0, 0), (0, 0, 1), (1, 0, 0), lambert((0.5, 0.5, 0.5)))
     lamp = quad((0, 0.001, 0), (1, 0, 0), (0, 0, 1), lambert((0, 0, 0), emission=(1.0, 1.0, 1.0), double_sided=False))
     cover = quad((0, 5, 0), (1, 0, 0), (0, 0, 1))
