@@ -29,6 +29,8 @@ def parse_texel_sets(text: str) -> dict[str, float] | None:
     if text in ("auto", "one"):
         return None if text == "auto" else {}
     factors: dict[str, float] = {}
+    if not isinstance(text, str):
+        raise OptionError(f'texel_sets must be text, "auto", "one", or "NAME=FACTOR,...", got {text!r:.80}')
     for item in text.split(","):
         name, equals, number = (piece.strip() for piece in item.rpartition("="))
         try:

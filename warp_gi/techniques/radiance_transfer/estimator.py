@@ -16,6 +16,7 @@ from warp_gi.scene.baked import whole_scene
 from warp_gi.stateful import Ahead, Service
 from warp_gi.techniques.radiance_transfer.bake import bake_transfer, transfer_key
 from warp_gi.techniques.radiance_transfer.bounces import lamps_move
+from warp_gi.techniques.radiance_transfer.densities import parse_texel_sets
 from warp_gi.techniques.radiance_transfer.settings import TransferSettings
 from warp_gi.techniques.radiance_transfer.sky import SkyLight, TransferLight
 from warp_gi.techniques.radiance_transfer.state import TransferState, transfer_state
@@ -52,7 +53,7 @@ class RadianceTransfer(Estimator, RadianceCache):
     """Where transfer is kept: in texels of an atlas ("texture"), or at the vertices of meshes ("vertices"), as a
     baseline."""
     resolution: int = 1024
-    """Texels along a side of the atlas; several pages share its area."""
+    """Texels along the longer side of the atlas, which is one page; charts leave a few columns or rows unused."""
     texel_sets: str = "auto"
     """Densities of texels: "auto" gives small parts more, "one" is one density for all, "NAME=FACTOR,..." is a factor
     by name of node or mesh."""
@@ -107,6 +108,7 @@ class RadianceTransfer(Estimator, RadianceCache):
         for name, value, known in choices:
             if value not in known:
                 raise unknown_name(name, value, known)
+        parse_texel_sets(self.texel_sets)
         if self.order not in ORDERS:
             raise OptionError(f"order must be 5 or 6, got {self.order}")
         for name, low, high in (
