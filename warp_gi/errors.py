@@ -6,7 +6,6 @@ import difflib
 from collections.abc import Iterable
 from numbers import Integral
 
-
 MOST_NAMES = 64
 """Known names that an error lists."""
 

@@ -63,6 +63,10 @@ class RadianceTransferTool(BakeTool[RadianceTransfer]):
             if not settings.bounces:
                 raise OptionError("--export-components are of bounces, and --bounces is 0; leave one of them out")
 
+    def exported_files(self, path: Path) -> list[Path]:
+        """Return the files that ``export`` writes."""
+        return list(export_files.exported_files(path).values())
+
     def export(self, bake: Bake, path: Path, scene: Scene, components: int) -> list[Path]:
         """Write images, surfaces and their description."""
         return export_files.export_textures(bake, path, scene, components)
