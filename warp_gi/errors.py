@@ -31,17 +31,17 @@ def one_line(message: object, otherwise: str = "") -> str:
     return " ".join(str(message).split()) or otherwise
 
 
-def unknown_name(kind: str, name: str, known: Iterable[str]) -> OptionError:
+def unknown_name(kind: str, name: object, known: Iterable[str]) -> OptionError:
     """Return an error for an unknown ``name`` that lists the known ones and the nearest match.
 
     Of more than MOST_NAMES, as a scene's nodes may be, it lists those that are nearest.
     """
     known = sorted(known)
-    near = difflib.get_close_matches(name, known, n=1)
+    near = difflib.get_close_matches(str(name), known, n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     shown = known
     if len(known) > MOST_NAMES:
-        shown = difflib.get_close_matches(name, known, n=MOST_NAMES // 8, cutoff=0.3) or known[: MOST_NAMES // 8]
+        shown = difflib.get_close_matches(str(name), known, n=MOST_NAMES // 8, cutoff=0.3) or known[: MOST_NAMES // 8]
     more = f" and {len(known) - len(shown):,} others" if len(shown) < len(known) else ""
     return OptionError(f"unknown {kind} {name!r}{hint} (known: {', '.join(shown)}{more})")
 

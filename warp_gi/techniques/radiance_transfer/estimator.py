@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import TYPE_CHECKING, Literal
 
 from warp_gi.errors import OptionError, unknown_name
@@ -123,14 +124,14 @@ class RadianceTransfer(Estimator, RadianceCache):
                 raise OptionError(f"{name} must be a whole number from {low} to {high}, got {value!r}")
         if self.rays < self.first_rays:
             raise OptionError(f"rays must be at least first_rays ({self.first_rays}), got {self.rays}")
-        if 0 < self.sun <= 1:
-            raise OptionError(f"sun must be 0 (no suns apart) or a number of means above 1, got {self.sun}")
         if self.term == "indirect" and self.bounces == 0:
             raise OptionError('term "indirect" needs bounces of at least 1, got 0: leave the term out (None)')
         for name in ("chart_seconds", "tolerance", "sun", "ratio_below", "traced_below", "window"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise OptionError(f"{name} must be finite and not negative, got {value}")
+            if not (isinstance(value, Real) and math.isfinite(value) and float(value) >= 0):
+                raise OptionError(f"{name} must be a finite number that is not negative, got {value!r}")
+        if 0 < self.sun <= 1:
+            raise OptionError(f"sun must be 0 (no suns apart) or a number of means above 1, got {self.sun}")
 
     @property
     def transfer_settings(self) -> TransferSettings:
