@@ -128,6 +128,8 @@ def check_export_name(path: str | Path) -> None:
     if path.suffix.lower() != ".exr":
         raise OptionError(f"cannot write {path.name}: transfer textures are .exr files; give NAME.exr")
     for file in exported_files(path).values():
+        if file.is_dir():
+            raise OptionError(f"{file}: is a folder; give another name")
         if file.exists() and not _is_exported(file):
             raise OptionError(
                 f"{file} exists and is not of an earlier export, which would overwrite it: give another name"
