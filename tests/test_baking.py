@@ -245,7 +245,11 @@ def test_check_says_why():
     assert "is of an unnamed scene (hash ab12cd34ef56), not of an unnamed scene (hash 0123456789ab)" in unsuitable(
         make_bake(scene_name=""), "VisibilityField", OTHER_KEY, {}
     )
-    assert unsuitable(bake, "VisibilityField", OTHER_KEY, {}, "atrium") == (
+    changed = unsuitable(bake, "VisibilityField", OTHER_KEY, asked | {"mode": "plain"}, "atrium")
+    assert changed == (
+        "this bake has other settings (mode: bake has 'cubes', asked for 'plain'): bake it again or ask for its own"
+    )
+    assert unsuitable(bake, "VisibilityField", OTHER_KEY, asked, "atrium") == (
         "this bake is of scene 'atrium' as it was (hash ab12cd34ef56, now 0123456789ab): "
         "what it depends on has changed since; bake it again"
     )

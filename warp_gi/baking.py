@@ -98,26 +98,30 @@ class Bake:
         return self.settings == dict(settings)
 
     def check(self, technique: str, scene_key: str, settings: Mapping[str, Setting], scene_name: str = "") -> None:
-        """Raise BakeError saying why, unless the bake is by ``technique``, of this scene and with these settings."""
+        """Raise BakeError saying why, unless the bake is by ``technique``, of this scene and with these settings.
+
+        For a scene of the same name other settings come first: the hash of what a bake depends on may follow from them.
+        """
         if technique != self.technique:
             raise BakeError(
                 f"this bake is by {self.technique!r}, not by {technique!r}: name its own file or bake it again"
-            )
-        if scene_key != self.scene_key and self.scene_name and scene_name == self.scene_name:
-            raise BakeError(
-                f"this bake is of scene {scene_name!r} as it was (hash {self.scene_key[:12]}, now {scene_key[:12]}): "
-                "what it depends on has changed since; bake it again"
-            )
-        if scene_key != self.scene_key:
-            raise BakeError(
-                f"this bake is of {'scene ' if self.scene_name else ''}{_scene(self.scene_name, self.scene_key)}, "
-                f"not of {_scene(scene_name, scene_key)}: bake it again"
             )
         differing = [
             f"{name}: bake has {_shown(self.settings, name)}, asked for {_shown(settings, name)}"
             for name in sorted({*self.settings, *settings})
             if name not in self.settings or name not in settings or self.settings[name] != settings[name]
         ]
+        is_of_scene = bool(self.scene_name) and scene_name == self.scene_name
+        if scene_key != self.scene_key and is_of_scene and not differing:
+            raise BakeError(
+                f"this bake is of scene {scene_name!r} as it was (hash {self.scene_key[:12]}, now {scene_key[:12]}): "
+                "what it depends on has changed since; bake it again"
+            )
+        if scene_key != self.scene_key and not is_of_scene:
+            raise BakeError(
+                f"this bake is of {'scene ' if self.scene_name else ''}{_scene(self.scene_name, self.scene_key)}, "
+                f"not of {_scene(scene_name, scene_key)}: bake it again"
+            )
         if differing:
             raise BakeError(f"this bake has other settings ({'; '.join(differing)}): bake it again or ask for its own")
 

@@ -6,6 +6,9 @@ import difflib
 from collections.abc import Iterable
 from numbers import Integral
 
+MOST_NAMES = 64
+"""Known names that an error lists."""
+
 
 class GiError(ValueError):
     """Base of every error that says what was expected, what came and what to do."""
@@ -28,12 +31,19 @@ def one_line(message: object, otherwise: str = "") -> str:
     return " ".join(str(message).split()) or otherwise
 
 
-def unknown_name(kind: str, name: str, known: Iterable[str]) -> OptionError:
-    """Return an error for an unknown ``name`` that lists the known ones and the nearest match."""
+def unknown_name(kind: str, name: object, known: Iterable[str]) -> OptionError:
+    """Return an error for an unknown ``name`` that lists the known ones and the nearest match.
+
+    Of more than MOST_NAMES, as a scene's nodes may be, it lists those that are nearest.
+    """
     known = sorted(known)
-    near = difflib.get_close_matches(name, known, n=1)
+    near = difflib.get_close_matches(str(name), known, n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
-    return OptionError(f"unknown {kind} {name!r}{hint} (known: {', '.join(known)})")
+    shown = known
+    if len(known) > MOST_NAMES:
+        shown = difflib.get_close_matches(str(name), known, n=MOST_NAMES // 8, cutoff=0.3) or known[: MOST_NAMES // 8]
+    more = f" and {len(known) - len(shown):,} others" if len(shown) < len(known) else ""
+    return OptionError(f"unknown {kind} {name!r}{hint} (known: {', '.join(shown)}{more})")
 
 
 def check_whole(name: str, value: object, least: int, most: int) -> None:

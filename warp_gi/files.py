@@ -45,7 +45,14 @@ def replacing(path: str | Path, own_folder: bool = False) -> Iterator[Path]:
 
 def check_writable(folder: Path) -> None:
     """Make the folder; raises OSError now, not after an hour's work, if nothing can be written there."""
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        file = next((path for path in (folder, *folder.parents) if path.exists() and not path.is_dir()), None)
+        problem = f"this folder cannot be made ({error.strerror}); give another one"
+        if file is not None:
+            problem = "is a file, expected a folder; give another one"
+        raise OSError(error.errno, problem, str(file or folder)) from error
     try:
         with tempfile.TemporaryFile(dir=folder):
             pass

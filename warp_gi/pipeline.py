@@ -106,15 +106,17 @@ class Pipeline:
         Raises OptionError where two ask for one with different settings, and no field here has its name.
         """
         found: dict[str, Service] = {}
+        asked: dict[str, str] = {}
 
         def gather(place: str, part: Stateful) -> None:
             for service in part.services:
                 service = self._settings_of(service)
                 gather(service.name, service)
+                other = asked.setdefault(service.name, place)
                 if (known := found.setdefault(service.name, service)) != service:
                     raise OptionError(
-                        f"{place} asks for the service {service.name!r} with other settings than others do "
-                        f"({_differing(service, known)}): make them equal"
+                        f"{place} and {other} share the service {service.name!r}, which takes one value of each "
+                        f"setting, got {_differing(service, known, place, other)}: make them equal"
                     )
 
         for place, part in (*self.radiance_caches(), *self.estimators()):
@@ -251,15 +253,16 @@ def estimator_named(term: str, name: str) -> Estimator:
     return classes[name](term=term) if takes_term else classes[name]()
 
 
-def _differing(one: Any, other: Any) -> str:
-    """Return the settings in which two dataclasses differ, those within settings by their own names."""
+def _differing(one: Any, other: Any, here: str, there: str) -> str:
+    """Return the settings in which two dataclasses in two places differ, those within settings by their own names."""
     found = []
     for name in (each.name for each in fields(one)):
         mine, theirs = getattr(one, name), getattr(other, name, None)
         if mine != theirs:
             both = is_dataclass(mine) and type(mine) is type(theirs)
-            found.append(_differing(mine, theirs) if both else f"{name} {mine!r}, others {theirs!r}")
-    return "; ".join(found) or f"{type(one).__name__}, others {type(other).__name__}"
+            text = f"{name} {mine!r} for {here} and {theirs!r} for {there}"
+            found.append(_differing(mine, theirs, here, there) if both else text)
+    return "; ".join(found) or f"{type(one).__name__} for {here} and {type(other).__name__} for {there}"
 
 
 def _is_whole(estimator: Estimator) -> bool:

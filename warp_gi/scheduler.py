@@ -326,7 +326,10 @@ def _bakes_by_class(bakes: Iterable[Bake], parts: dict[str, Stateful]) -> dict[s
     for one in bakes:
         if one.technique not in found:
             names = ", ".join(sorted(found)) or "none"
-            raise BakeError(f"a bake of {one.technique} was given, but the pipeline's estimators are: {names}")
+            raise BakeError(
+                f"a bake of {one.technique} was given, but the pipeline's estimators are: {names}; leave it out, "
+                "or name another pipeline"
+            )
         found[one.technique].append(one)
     return found
 

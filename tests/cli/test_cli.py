@@ -515,3 +515,38 @@ def test_large_arrays_do_not_live_in_the_heap(told):
     found = subprocess.run([sys.executable, "-c", HEAP], capture_output=True, text=True, env=environment, check=True)
     mapped, heap = map(int, found.stdout.split())
     assert mapped < 1e5 if told else (mapped > 6e6 and heap < 1e5), found.stdout
+
+
+@pytest.mark.parametrize(
+    "given, wanted",
+    [
+        (["--environment.resolution", "512"], ("resolution", 512, 512)),
+        (["--indirect.resolution=512"], ("resolution", 512, 512)),
+        (["--indirect.first_rays=16"], ("first_rays", 16, 16)),
+        (["--environment.no-soft-suns"], ("soft_suns", False, False)),
+        (["--environment.resolution=512", "--indirect.resolution", "1024"], ("resolution", 512, 1024)),
+        (["--indirect.resolution=256", "--environment.resolution", "512"], ("resolution", 512, 256)),
+        (["--environment.order=6"], ("resolution", 1024, 1024)),
+    ],
+)
+def test_terms_of_one_estimator_share_what_is_given_for_one(given, wanted):
+    name, environment, indirect = wanted
+    settings = parse(["--pipeline=transfer", *given]).settings
+    assert (getattr(settings.environment, name), getattr(settings.indirect, name)) == (environment, indirect)
+    assert (settings.environment.term, settings.indirect.term) == ("environment", "indirect")
+
+
+def test_terms_of_other_estimators_share_nothing():
+    default = parse(["--pipeline=reuse"]).settings
+    settings = parse(["--pipeline=reuse", "--indirect.max-depth=3", "--emitters.exploration=0.25"]).settings
+    assert settings.environment == default.environment and settings.indirect.max_depth == 3
+    alone = parse(["--pipeline=transfer,environment=TracedEnvironment", "--indirect.resolution=128"]).settings
+    assert alone.indirect.resolution == 128 and not hasattr(alone.environment, "resolution")
+
+
+def test_unequal_settings_of_a_shared_bake_name_both_terms(capfd, tmp_path):
+    arguments = ["render", "cornell_box", "--pipeline=transfer", "--environment.resolution=64", "--frames=0"]
+    assert cli.main([*arguments, "--indirect.resolution=32", "-o", str(tmp_path / "a.exr")]) == 2
+    error = capfd.readouterr().err
+    assert error.count("\n") == 1 and "resolution 32 for indirect and 64 for environment: make them equal" in error
+    assert list(tmp_path.iterdir()) == []

@@ -1,8 +1,12 @@
 """Atlases of transfer textures: what a bilinear fetch finds, which backs have slots, and what is kept on disk."""
 
 import dataclasses
+import os
+import re
 import subprocess
+import sys
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -349,6 +353,14 @@ def test_unknown_name_in_texel_sets():
         density_factors(scene, "toys=2", np.ones(2), np.ones(2, int), 1 << 14)
 
 
+def test_unknown_names_among_thousands_are_told_in_one_line():
+    mesh = quad((0, 0, 0), (1, 0, 0), (0, 0, 1))
+    scene = gi.Scene([gi.Node(f"chair {k}", [mesh]) for k in range(500)], environment=1.0)
+    with pytest.raises(gi.OptionError, match=r"did you mean 'chair 49.*known: chair .* and [0-9]+ others") as told:
+        density_factors(scene, "chairs 49=2", np.ones(500), np.ones(500, int), 1 << 14)
+    assert len(str(told.value)) < 300
+
+
 def test_automatic_factors_keep_to_their_share():
     areas, counts = np.array([100.0, 1.0, 0.0]), np.array([2, 40000, 0])
     factors = automatic_factors(areas, counts, 1 << 16)
@@ -407,11 +419,51 @@ def test_limits_are_shared_by_the_jobs_of_an_atlas(monkeypatch):
     assert 0.0 < job.used < 100.0
 
 
-def test_charts_that_do_not_fit():
-    rng = np.random.default_rng(0)
-    soup = gi.Mesh(rng.random((900, 3)).astype(np.float32), np.arange(900).reshape(-1, 3))
-    with pytest.raises(gi.OptionError, match=r"resolution 16 is too small for the [0-9]+ charts"):
-        make_atlas(scene_of(soup), settings(resolution=16), "cpu")
+def test_files_beside_the_worker_are_not_taken_for_modules(monkeypatch, tmp_path):
+    """Neither in its folder nor in the one that this process is in, nor in one that a script here imports from."""
+    monkeypatch.setattr(charts.ChartJob, "run", RUN)
+    for folder in ("worker", "here", "script"):
+        (tmp_path / folder).mkdir()
+        for name in ("numpy", "types", "signal", "runpy", "xatlas"):
+            (tmp_path / folder / f"{name}.py").write_text(f"raise ImportError('{folder}')")
+    worker = tmp_path / "worker" / "chart_worker.py"
+    worker.write_bytes(chart_job.WORKER.read_bytes())
+    monkeypatch.setattr(chart_job, "WORKER", worker)
+    monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.syspath_prepend(tmp_path / "script")
+    charts.cut_charts(np.random.default_rng(5).random((4, 3, 3)), np.zeros(4, np.int32), charts.ChartJob(0.0), None)
+
+
+def test_the_worker_imports_packages_from_where_this_process_does(monkeypatch, tmp_path):
+    monkeypatch.setattr(charts.ChartJob, "run", RUN)
+    (tmp_path / "xatlas.py").write_text("raise ImportError('found')")
+    monkeypatch.setattr(chart_job.importlib.util, "find_spec", lambda name: None)
+    assert chart_job._package_folders() == []
+    monkeypatch.undo()
+    folders = chart_job._package_folders()
+    assert all((Path(folder) / "numpy").is_dir() or list(Path(folder).glob("xatlas*")) for folder in folders)
+    assert len(folders) == 2
+
+
+def soup(count):
+    """Return a mesh of triangles that hang together nowhere."""
+    points = np.random.default_rng(0).random((3 * count, 3)).astype(np.float32)
+    return gi.Mesh(points, np.arange(3 * count).reshape(-1, 3))
+
+
+@pytest.mark.parametrize("size", [16, 80])
+def test_charts_that_do_not_fit(size, monkeypatch):
+    """The error names a resolution that will do, and leaves charts half of the page."""
+    monkeypatch.setattr(charts, "STEP", 4)
+    scene = scene_of(soup(300))
+    words = rf'resolution {size} is too small for the [0-9]+ charts .*: take about ([0-9]+), .*charts="own".*"vertices"'
+    with pytest.raises(gi.OptionError, match=words) as told:
+        make_atlas(scene, settings(resolution=size), "cpu")
+    wanted = int(re.search("take about ([0-9]+)", str(told.value))[1])
+    assert size < wanted <= 200
+    atlas = make_atlas(scene, settings(resolution=wanted), "cpu")
+    assert (atlas.face_pages == 0).all() and len(atlas.pages) == 1
+    assert np.count_nonzero(atlas.slots[0] >= 0) > 0.4 * atlas.slots.shape[1]
 
 
 def test_cache(monkeypatch, tmp_path):
@@ -436,6 +488,105 @@ def test_cache(monkeypatch, tmp_path):
     for again in (second, third, fourth):
         for field in dataclasses.fields(Atlas):
             assert np.array_equal(getattr(again, field.name), getattr(first, field.name)), field.name
+
+
+def change(arrays, how):
+    """Make one array another than a worker's could be."""
+    name, how = how.split(": ")
+    if how == "missing":
+        del arrays[name]
+    elif how == "NaN":
+        arrays[name][1, 0] = np.nan
+    elif how == "longer":
+        arrays[name] = np.concatenate([arrays[name], arrays[name][:1]])
+    elif how == "another type":
+        arrays[name] = arrays[name].astype(np.float64)
+    else:
+        arrays[name].reshape(-1)[1] = float(how)
+
+
+@pytest.mark.parametrize(
+    "kind, how",
+    [
+        *[("cut", f"{name}: {how}") for name in ("uvs", "charts") for how in ("missing", "longer", "another type")],
+        *[("page", f"{name}: missing") for name in ("corners", "is_placed", "page", "least")],
+        *[("page", f"{name}: another type") for name in ("corners", "is_placed", "page")],
+        ("cut", "uvs: NaN"),
+        ("page", "corners: NaN"),
+        ("page", "corners: 65.5"),
+        ("page", "corners: -1"),
+        ("page", "page: 100000"),
+        ("cut", "charts: -2"),
+        ("cut", "charts: 1000000"),
+    ],
+)
+def test_whole_files_with_wrong_contents_are_made_again(monkeypatch, tmp_path, kind, how):
+    monkeypatch.setattr(chart_cache, "cache_folder", lambda: tmp_path)
+    scene = scene_of(ball(rings=4))
+    first = make_atlas(scene, settings(resolution=64), "cpu")
+    (file,) = tmp_path.glob(f"{kind}-*.npz")
+    with np.load(file) as stored:
+        arrays = {name: array.copy() for name, array in stored.items()}
+    change(arrays, how)
+    np.savez(file, **arrays)
+    with pytest.warns(UserWarning, match="is damaged .*charts are made again"):
+        again = make_atlas(scene, settings(resolution=64), "cpu")
+    assert np.array_equal(again.corners, first.corners)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make_atlas(scene, settings(resolution=64), "cpu")
+
+
+def test_files_that_another_process_removes_at_once(monkeypatch, tmp_path):
+    """As it lists them, and as it removes them."""
+    monkeypatch.setattr(chart_cache, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(chart_cache, "MOST_BYTES", 10)
+    for number in range(2):
+        (tmp_path / f"{number}.npz").write_bytes(bytes(90 + number))
+    stat, gone = Path.stat, []
+
+    def raced(path, **options):
+        found = None if path.name == "0.npz" else stat(path, **options)
+        if path.suffix == ".npz" and path.exists() and path.name != "new.npz":
+            path.unlink()
+            gone.append(path.name)
+        return found or stat(path, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "exists", lambda path: os.path.exists(path))
+        patch.setattr(Path, "stat", raced)
+        chart_cache._prune(tmp_path)
+    assert sorted(gone) == ["0.npz", "1.npz"] and not list(tmp_path.iterdir())
+
+
+def test_two_processes_that_bake_one_scene_at_once(tmp_path):
+    """Both have the charts, the cache has them once, and nothing else is left there."""
+    script = """
+import sys
+import numpy as np
+from warp_gi.techniques.radiance_transfer import charts
+print("ready", flush=True)
+sys.stdin.readline()
+points = np.random.default_rng(0).random((40, 3, 3))
+uvs, _ = charts.cut_charts(points, np.zeros(40, np.int32), charts.ChartJob(0.0), None)
+print(float(np.abs(uvs).sum()))
+"""
+    pipe = subprocess.PIPE
+    both = [
+        subprocess.Popen(
+            [sys.executable, "-W", "error", "-c", script], stdin=pipe, stdout=pipe, stderr=pipe, text=True,
+            env={**os.environ, "XDG_CACHE_HOME": str(tmp_path)},
+        )
+        for _ in range(2)
+    ]  # fmt: skip
+    assert [process.stdout.readline() for process in both] == ["ready\n", "ready\n"]
+    for process in both:
+        process.stdin.write("go\n")
+        process.stdin.flush()
+    results = [process.communicate() for process in both]
+    assert [process.returncode for process in both] == [0, 0], results
+    assert results[0][0] == results[1][0] and float(results[0][0]) > 0
+    assert [path.name[:4] for path in (tmp_path / "warp_gi" / "charts").iterdir()] == ["cut-"]
 
 
 def test_a_cache_that_cannot_be_written(monkeypatch, tmp_path):

@@ -168,7 +168,7 @@ def test_degenerate_and_moving_faces_have_no_vertices():
     line = gi.Scene([gi.Node("line", [replace(mesh, indices=np.int32([[0, 0, 1]]))])])
     assert vertex_atlas(line).count == 0
     for storage in ("texture", "vertices"):
-        with pytest.raises(SceneError, match="no surface in this scene rests and has an area; nothing can be baked"):
+        with pytest.raises(SceneError, match="no surface in this scene rests and has an area, so nothing can be baked"):
             bake_transfer(line, transfer_settings(storage=storage), "cpu")
 
 

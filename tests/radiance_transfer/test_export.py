@@ -342,9 +342,33 @@ def damaged(folder, how):
         text.write_text("[]")
     elif how == "a part missing":
         info["parts"][0]["name"] = "page9.front.mask"
-        text.write_text(json.dumps(info))
+    elif how == "a channel missing":
+        info["parts"][0]["channels"] = ["Z"]
     elif how == "no parts":
         del info["parts"]
+    elif how == "no mask":
+        info["parts"] = [part for part in info["parts"] if part["kind"] != "mask"]
+    elif how == "transfer as mask":
+        info["parts"][0] |= {"name": "page0.front.transfer", "channels": ["T.03"]}
+    elif how == "another page's mask":
+        info["parts"][0]["name"] = "page1.front.mask"
+    elif how == "too few channels":
+        info["parts"][1]["channels"].pop()
+    elif how == "a page too many":
+        info["parts"][0]["page"] = 7
+    elif how == "a negative page":
+        info["parts"][0]["page"] = -1
+    elif how == "a kind":
+        info["parts"][0]["kind"] = "colour"
+    elif how == "a side":
+        info["parts"][0]["side"] = "top"
+    elif how == "another size":
+        info["pages"][0]["width"] = 3
+    elif how == "a basis":
+        info["components"] = {"basis": [[1.0, 2.0]]}
+    elif how.startswith("file "):
+        info["file"] = json.loads(how[5:].replace("HERE", str(folder)))
+    if text.exists() and how not in ("of another export", "newer", "foreign", "not JSON", "a list"):
         text.write_text(json.dumps(info))
 
 
@@ -363,8 +387,32 @@ def damaged(folder, how):
         ("foreign", "does not describe warp_gi transfer textures"),
         ("not JSON", "does not describe warp_gi transfer textures"),
         ("a list", "does not describe warp_gi transfer textures"),
-        ("a part missing", "does not fit its images"),
-        ("no parts", "does not fit its images"),
+        ("a part missing", "court.exr: has no part 'page9.front.mask', which its description names"),
+        ("a channel missing", "court.exr: part 'page0.front.mask' has no channel 'Z'"),
+        ("no parts", "does not fit its images (has no 'parts')"),
+        ("no mask", "there is no part page0.front.mask"),
+        ("transfer as mask", "page0.front.mask has numbers other than 0 and 1"),
+        ("another page's mask", "page0.front.mask has "),
+        ("too few channels", "numbers, expected "),
+        ("a page too many", "page7.front.mask is of none of its 2 pages"),
+        ("a negative page", "is of none of its 2 pages"),
+        ("a kind", "is of no kind that is known (mask, transfer, bounces, lamps)"),
+        ("a side", "does not fit its images"),
+        ("another size", "numbers, expected 3 x "),
+        ("a basis", "the basis of its components is not of 75 finite numbers each"),
+        *[
+            (f"file {name}", "expected the name of a file beside it")
+            for name in (
+                '"../court.exr"',
+                '"HERE/court.exr"',
+                '"a/court.exr"',
+                '".."',
+                '""',
+                "7",
+                "null",
+                '"..\\\\a.exr"',
+            )
+        ],
     ],
 )
 def test_files_that_cannot_be_read_are_one_line(exported, tmp_path, capfd, how, words):
@@ -456,3 +504,20 @@ def test_no_file_of_another_is_overwritten(tmp_path):
     with pytest.raises(gi.OptionError, match=r"hall\.glb exists and is not of an earlier export"):
         export.check_export_name(tmp_path / "hall.exr")
     export.check_export_name(tmp_path / "other.exr")
+
+
+@pytest.mark.parametrize("end", ["exr", "rgba.exr", "glb", "json"])
+def test_each_file_that_is_not_of_an_export_is_left_alone(exported, scene, tmp_path, end):
+    """Also where the others are of one: a sky may have come in place of what was exported."""
+    textures, path = exported
+    shutil.copytree(path.parent, tmp_path / "copy")
+    copy = tmp_path / "copy" / "court.exr"
+    export.check_export_name(copy)
+    file = copy.with_name(f"court.{end}")
+    file.write_bytes(b"another's")
+    with pytest.raises(OptionError, match=rf"court\.{end} exists and is not of an earlier export"):
+        export.export_textures(bake_of(textures, scene), copy, scene)
+    assert file.read_bytes() == b"another's"
+    file.unlink()
+    export.export_textures(bake_of(textures, scene), copy, scene)
+    assert len(read_export(copy).images) == len(read_export(path).images)

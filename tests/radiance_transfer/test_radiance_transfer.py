@@ -78,7 +78,7 @@ def test_a_turned_sky_is_the_sky_of_a_turned_map():
 
 
 def test_terms_with_other_bakes_are_refused():
-    with pytest.raises(gi.OptionError, match=r"other settings than others do \(resolution 64, others 96\): make them"):
+    with pytest.raises(gi.OptionError, match="resolution 64 for indirect and 96 for environment: make them"):
         gi.FrameScheduler(corner(1.0), view(), pipeline(indirect=replace(INDIRECT, resolution=64)))
 
 
@@ -89,8 +89,14 @@ def test_terms_with_other_bakes_are_refused():
         ({"order": 4}, "order must be 5 or 6, got 4"),
         ({"rays": 16}, r"rays must be at least first_rays \(128\), got 16"),
         ({"resolution": 8}, "resolution must be a whole number from 16 to 16384, got 8"),
-        ({"sun": float("nan")}, "sun must be finite and not negative, got nan"),
+        ({"sun": float("nan")}, "sun must be a finite number that is not negative, got nan"),
         ({"storage": "voxels"}, "unknown storage 'voxels'"),
+        ({"storage": 3}, "unknown storage 3"),
+        ({"texel_sets": "toy"}, 'texel_sets must be "auto", "one", or "NAME=FACTOR,..."'),
+        ({"texel_sets": "toy=2,toy=3"}, "texel_sets names 'toy' twice"),
+        ({"texel_sets": {"toy": 2}}, "texel_sets must be text"),
+        ({"sun": "bright"}, "sun must be a finite number that is not negative, got 'bright'"),
+        ({"chart_seconds": None}, "chart_seconds must be a finite number that is not negative, got None"),
     ],
 )
 def test_settings_out_of_range(settings, told):

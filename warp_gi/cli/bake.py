@@ -168,13 +168,13 @@ def run(options: BakeOptions, report: Reporter) -> None:
         camera = camera.at_resolution(*resolution)
     report.line(f"{scene.name}: {scene.triangle_count:,} triangles")
     tool.check_scene(options.settings, scene)
-    for file in (output, options.export, options.view):
-        if file is not None and file.is_dir():
-            raise OptionError(f"{file}: is a folder; name a file in it")
+    files = [output, *(tool.exported_files(options.export) if options.export else ()), *filter(None, [options.view])]
+    check_files(options, files)
     folders = [output.parent, options.show, *(file and file.parent for file in (options.export, options.view))]
     for folder in filter(None, folders):
         check_writable(folder)
-    remove_stale_parts(output)
+    for file in files:
+        remove_stale_parts(file)
     started, compiled = time.perf_counter(), launch.compile_seconds
     with report.shares("bake") as tell:
         result = bake(
@@ -192,9 +192,9 @@ def run(options: BakeOptions, report: Reporter) -> None:
         report.line(f"{compiled:.1f} s of that compiling kernels")
     if options.export is not None:
         with report.phase("export"):
-            files = tool.export(result, options.export, scene, options.export_components)
-        more = f" to {files[-2].name}" * (len(files) > 2)
-        report.line(f"{tool.exported}: {files[0]}{more}, described by {files[-1]}")
+            exported = tool.export(result, options.export, scene, options.export_components)
+        more = f" to {exported[-2].name}" * (len(exported) > 2)
+        report.line(f"{tool.exported}: {exported[0]}{more}, described by {exported[-1]}")
     if options.view is not None and camera is not None:
         with report.phase("view"):
             page = tool.view(result, scene, first_view(camera), options.view)
@@ -208,6 +208,17 @@ def run(options: BakeOptions, report: Reporter) -> None:
     if advice := tool.advice(result, options.settings):
         report.line(advice)
     report.line(f"bake: {output}")
+
+
+def check_files(options: BakeOptions, files: Sequence[Path]) -> None:
+    """Raise OptionError for files to write that are folders, or that are read."""
+    read = {name: Path(name) for name in (options.scene, options.environment, options.camera) if Path(name).is_file()}
+    for file in files:
+        if file.is_dir():
+            raise OptionError(f"{file}: is a folder; name a file in it")
+        for name, path in read.items():
+            if file.exists() and file.samefile(path):
+                raise OptionError(f"{file} would be written over {name}, which is read: give another name")
 
 
 def show(

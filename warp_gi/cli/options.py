@@ -15,6 +15,17 @@ from warp_gi.errors import OptionError
 
 Options = TypeVar("Options")
 
+_PLAIN = (
+    (r"Error parsing settings\.([\w.]+): ", r"\1: "),
+    (r"Error parsing (--[\w.-]+): invalid literal for int\(\) with base 10: ", r"\1 must be a whole number, got "),
+    (r"Error parsing (--[\w.-]+): could not convert string to float: ", r"\1 must be a number, got "),
+    (
+        r"Error parsing (--[\w.-]+): no type matching (\S+) could be instantiated from (\S+)\. .*",
+        r"\1 must be \2, got \3",
+    ),
+)
+"""Patterns in what tyro says, and plainer words."""
+
 
 def flag(metavar: str, default: str, *aliases: str) -> object:
     """Return how tyro shows a flag: what stands for its value, and its default in words."""
@@ -64,6 +75,8 @@ def _first_error(report: str, command: str) -> str:
     parts = [part for part in re.split(r"^[─-]{3,}$", "\n".join(lines), flags=re.MULTILINE) if part.strip()]
     told = parts[1:] if len(parts) > 1 and "╭" not in report else parts
     message = re.sub(r"\s+", " ", told[0]).strip().rstrip(". ") if told else "options that cannot be read"
+    for pattern, words in _PLAIN:
+        message = re.sub(pattern, words, message)
     suggestion = re.search(r"Perhaps you meant:\s+(--[\w.-]+)", "\n".join(told))
     hint = f"; did you mean {suggestion.group(1)}?" if suggestion else ""
     return f"{message}{hint} (see warp-gi {command} --help)"

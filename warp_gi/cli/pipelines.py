@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -35,6 +36,32 @@ def pipeline_named(text: str) -> Pipeline:
             changed: dict[str, Any] = {term: estimator}
             pipeline = replace(pipeline, **changed)
     return pipeline
+
+
+def with_settings_shared(pipeline: Pipeline, arguments: Sequence[str]) -> Pipeline:
+    """Return a pipeline in which estimators of one class, in several terms, share the settings that were given.
+
+    A setting that ``arguments`` give for one of the terms alone holds for the others, too: such estimators share
+    their bake. Where they give it for several, each keeps its own.
+    """
+    given = [argument.partition("=")[0].replace("_", "-") for argument in arguments]
+    changed: dict[str, dict[str, Any]] = {}
+    for term, estimator in pipeline.estimators():
+        others = [other for other, one in pipeline.estimators() if other != term and type(one) is type(estimator)]
+        for name in (one.name for one in fields(estimator) if one.name != "term"):
+            if others and not _is_given(term, name, given):
+                source = next((other for other in others if _is_given(other, name, given)), term)
+                changed.setdefault(term, {})[name] = getattr(getattr(pipeline, source), name)
+    return replace(
+        pipeline, **{term: replace(getattr(pipeline, term), **settings) for term, settings in changed.items()}
+    )
+
+
+def _is_given(term: str, name: str, given: Sequence[str]) -> bool:
+    """Return whether a flag sets a term's setting, or one within it."""
+    name = name.replace("_", "-")
+    flags = f"--{term}.{name}", f"--{term}.no-{name}"
+    return any(flag in flags or flag.startswith(f"{flags[0]}.") for flag in given)
 
 
 def _ending(pipeline: Pipeline, term: str, name: str) -> Pipeline:

@@ -23,7 +23,7 @@ from warp_gi.cli.inputs import (
 )
 from warp_gi.cli.interrupts import stoppable
 from warp_gi.cli.options import flag, parse_options, value_given
-from warp_gi.cli.pipelines import find_denoiser, pipeline_named
+from warp_gi.cli.pipelines import find_denoiser, pipeline_named, with_settings_shared
 from warp_gi.cli.report import Reporter, run_command
 from warp_gi.errors import OptionError
 from warp_gi.files import check_writable
@@ -41,6 +41,9 @@ DESCRIPTION = """Render a sequence of frames to EXR files with named layers, and
 
 Without SCENE, the built-in atrium along its camera path. Files appear whole or not at
 all: stop with Ctrl-C or kill the process at any time, and carry on with --resume.
+
+Settings of the pipeline are flags by term: --indirect.max-depth 4. Where one estimator serves two terms, as in
+transfer, one flag sets both: --environment.resolution 512; give both flags for two values.
 
   warp-gi render
   warp-gi render hall.glb --environment city.exr --camera path.json --frames 0-47 --spp 64
@@ -112,6 +115,7 @@ def parse(arguments: Sequence[str]) -> Render:
     if denoiser := value_given(arguments, "--denoise"):
         settings = replace(settings, denoise=find_denoiser(denoiser))
     options = parse_options(Render, "render", arguments, DESCRIPTION, Render(settings=settings))
+    options.settings = with_settings_shared(options.settings, arguments)
     if not options.scene and not {"--preview", "--no-preview"} & set(arguments):
         options.preview = True
     return options

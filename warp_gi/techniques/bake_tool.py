@@ -70,6 +70,10 @@ class BakeTool(ABC, Generic[Settings]):
     def check_export(self, settings: Settings, path: Path, components: int) -> None:
         """Raise OptionError for a file that an export cannot be, and for settings whose bake cannot be exported."""
 
+    def exported_files(self, path: Path) -> list[Path]:
+        """Return the files that ``export`` writes, but for those whose number the bake decides."""
+        return [path, path.with_suffix(".json")]
+
     @abstractmethod
     def export(self, bake: Bake, path: Path, scene: Scene, components: int) -> list[Path]:
         """Write the files of an export of the scene's bake and return them, the description last.

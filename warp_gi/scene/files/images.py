@@ -12,7 +12,9 @@ from warp_gi.errors import SceneError, one_line
 
 
 def missing_file(path: Path, what: str) -> SceneError:
-    """Return an error that says ``what`` is missing and names the nearest file in the folder."""
+    """Return an error that says ``what`` is a folder, or is missing, and names the nearest file in the folder."""
+    if path.is_dir():
+        return SceneError(f"{what} {str(path)!r} is a folder; name a file in it")
     if not path.parent.is_dir():
         return SceneError(f"{what} {str(path)!r} is missing: there is no folder {str(path.parent)!r}")
     near = difflib.get_close_matches(path.name, sorted(p.name for p in path.parent.iterdir()), n=1, cutoff=0.4)

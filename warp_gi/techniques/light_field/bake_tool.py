@@ -53,6 +53,11 @@ class LightFieldTool(BakeTool[LightFieldProbes]):
         """Raise OptionError unless the file is an .exr."""
         export_files.check_export_name(path)
 
+    def exported_files(self, path: Path) -> list[Path]:
+        """Return the files that ``export`` writes."""
+        atlases = [path.with_name(f"{path.stem}.{name}.exr") for name in export_files.ATLASES]
+        return [*atlases, *super().exported_files(path)[1:]]
+
     def export(self, bake: Bake, path: Path, scene: Scene, components: int) -> list[Path]:
         """Write the maps as atlases."""
         return export_files.export_atlases(bake, path)

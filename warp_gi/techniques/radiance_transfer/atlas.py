@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from warp_gi.errors import OptionError
+from warp_gi.errors import OptionError, SceneError
 from warp_gi.launch import get_device
 from warp_gi.scene.model import Mesh
 from warp_gi.scene.scene import Scene
@@ -23,6 +23,7 @@ from warp_gi.techniques.radiance_transfer.textures import Atlas
 
 Progress = Callable[[float], None]
 
+NO_SURFACE = "no surface in this scene rests and has an area, so nothing can be baked; give one with triangles that do"
 CUT_SHARE, PACKED_SHARE, COVERED_SHARE = 0.8, 0.9, 0.95
 """Shares of the whole that are done when charts are cut, packed, and their texels known."""
 
@@ -155,6 +156,14 @@ def can_be_charted(points: np.ndarray) -> np.ndarray:
     normal = np.cross(sides[:, 0], sides[:, 1])
     longest = np.maximum((sides**2).sum(axis=2).max(axis=1), ((sides[:, 1] - sides[:, 0]) ** 2).sum(axis=1))
     return np.isfinite(points).all(axis=(1, 2)) & (np.linalg.norm(normal, axis=1) > 1e-7 * longest)
+
+
+def check_surfaces(scene: Scene) -> None:
+    """Raise SceneError unless a surface of the scene rests and has an area."""
+    flat = scene._flat
+    rests = scene_parts(scene)[0] >= 0
+    if not (can_be_charted(flat.points[flat.indices].astype(np.float64)) & rests).any():
+        raise SceneError(NO_SURFACE)
 
 
 def scene_parts(scene: Scene) -> tuple[np.ndarray, list[tuple[str, Mesh]]]:

@@ -16,7 +16,7 @@ from warp_gi.errors import BakeError, SceneError
 from warp_gi.kernels.transfer_bake import BLACK
 from warp_gi.launch import get_device
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.radiance_transfer.atlas import make_atlas
+from warp_gi.techniques.radiance_transfer.atlas import NO_SURFACE, make_atlas
 from warp_gi.techniques.radiance_transfer.bounces import (
     gather_bounces,
     gather_light,
@@ -125,7 +125,7 @@ def bake_transfer(
             vertices = settings.storage == "vertices"
             atlas = vertex_atlas(scene) if vertices else make_atlas(scene, settings, device, told)
         if atlas.count == 0:
-            raise SceneError("no surface in this scene rests and has an area; nothing can be baked")
+            raise SceneError(NO_SURFACE)
         with stages.run("rays") as told:
             work = transfer_work(scene, atlas, settings, target, seed)
             lamps = _lamps(work, scene, seed)

@@ -13,6 +13,8 @@ from warp_gi.scene.scene import Scene
 from warp_gi.techniques.bake_tool import BakeTool, Rows, Table, times
 from warp_gi.techniques.radiance_transfer import export as export_files
 from warp_gi.techniques.radiance_transfer import pictures
+from warp_gi.techniques.radiance_transfer.atlas import check_surfaces
+from warp_gi.techniques.radiance_transfer.densities import check_texel_sets
 from warp_gi.techniques.radiance_transfer.estimator import RadianceTransfer
 from warp_gi.techniques.radiance_transfer.pca import CHANNELS
 from warp_gi.techniques.radiance_transfer.textures import transfer_textures
@@ -51,7 +53,9 @@ class RadianceTransferTool(BakeTool[RadianceTransfer]):
             )
 
     def check_scene(self, settings: RadianceTransfer, scene: Scene) -> None:
-        """Do nothing: what does not fit is known once there are charts."""
+        """Raise OptionError or SceneError for unknown names in texel sets, and a scene without a surface to bake."""
+        check_texel_sets(scene, settings.texel_sets)
+        check_surfaces(scene)
 
     def check_export(self, settings: RadianceTransfer, path: Path, components: int) -> None:
         """Raise OptionError unless the file is an .exr of texels, and for components of bounces that are not there."""
@@ -62,6 +66,10 @@ class RadianceTransferTool(BakeTool[RadianceTransfer]):
             check_whole("--export-components", components, 1, CHANNELS)
             if not settings.bounces:
                 raise OptionError("--export-components are of bounces, and --bounces is 0; leave one of them out")
+
+    def exported_files(self, path: Path) -> list[Path]:
+        """Return the files that ``export`` writes."""
+        return list(export_files.exported_files(path).values())
 
     def export(self, bake: Bake, path: Path, scene: Scene, components: int) -> list[Path]:
         """Write images, surfaces and their description."""

@@ -21,6 +21,8 @@ FORMAT = "warp_gi charts 1"
 """Changes with what a job's arrays mean. Charts by another version of xatlas, or of the worker, are made again, too."""
 MOST_BYTES = 2 << 30
 """Bytes of all files, above which those not read for longest are removed."""
+ROUNDING = 0.01
+"""Texels by which a corner may leave its page."""
 
 Arrays = dict[str, np.ndarray]
 
@@ -34,10 +36,11 @@ def cache_folder() -> Path:
 def cached(kind: str, job: Arrays, make: Callable[[], Arrays]) -> Arrays:
     """Return the arrays that were kept for a job of this kind; or make them, and keep them.
 
-    A damaged file is made again, with a warning, and a folder that cannot be written to is only a warning.
+    A file that is damaged, or whose arrays cannot be those of the job, is made again, with a warning. A folder that
+    cannot be written to is only a warning.
     """
     path = cache_folder() / f"{kind}-{_key(kind, job)}.npz"
-    found = _read(path)
+    found = _read(path, kind, job)
     if found is not None:
         return found
     made = make()
@@ -60,10 +63,11 @@ def _key(kind: str, job: Arrays) -> str:
     return digest.hexdigest()
 
 
-def _read(path: Path) -> Arrays | None:
+def _read(path: Path, kind: str, job: Arrays) -> Arrays | None:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
+        _check(kind, job, arrays)
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
@@ -74,11 +78,44 @@ def _read(path: Path) -> Arrays | None:
     return arrays
 
 
+def _check(kind: str, job: Arrays, arrays: Arrays) -> None:
+    """Raise ValueError unless arrays have the names, types, shapes and ranges of the worker's results for a job."""
+    faces = len(job["indices"] if kind == "cut" else job["charts"])
+    corners = "uvs" if kind == "cut" else "corners"
+    wanted: dict[str, tuple[type, tuple[int, ...]]] = {corners: (np.float32, (faces, 3, 2))}
+    if kind == "cut":
+        wanted["charts"] = np.int32, (faces,)
+    else:
+        wanted |= {"is_placed": (np.bool_, (faces,)), "page": (np.int32, (2,)), "least": (np.int64, ())}
+    if set(arrays) != set(wanted):
+        raise ValueError(f"has the arrays {', '.join(sorted(arrays))}, expected {', '.join(sorted(wanted))}")
+    for name, (dtype, shape) in wanted.items():
+        if arrays[name].dtype != dtype or arrays[name].shape != shape:
+            raise ValueError(f"{name} is {arrays[name].dtype} {arrays[name].shape}, expected {np.dtype(dtype)} {shape}")
+    if not np.isfinite(arrays[corners]).all():
+        raise ValueError(f"{corners} are not finite")
+    if kind == "cut":
+        if faces and not (arrays["charts"].min() >= -1 and arrays["charts"].max() < faces):
+            raise ValueError("charts are out of range")
+        return
+    page, placed = arrays["page"], arrays["corners"][arrays["is_placed"]]
+    within = (placed >= -ROUNDING).all() and (placed <= page + ROUNDING).all()
+    if not (within and (page >= 0).all() and (page <= job["size"]).all()):
+        raise ValueError("corners leave the page")
+
+
 def _prune(folder: Path) -> None:
-    """Remove the files that were not read for longest, until the rest are below MOST_BYTES."""
-    files = sorted(((p.stat().st_mtime, p.stat().st_size, p) for p in folder.glob("*.npz")), reverse=True)
+    """Remove the files that were not read for longest, until the rest are below MOST_BYTES.
+
+    Another process may remove the same files at the same time.
+    """
+    files = []
+    for path in folder.glob("*.npz"):
+        with contextlib.suppress(FileNotFoundError):
+            stat = path.stat()
+            files.append((stat.st_mtime, stat.st_size, path))
     total = 0
-    for _, size, path in files:
+    for _, size, path in sorted(files, reverse=True):
         total += size
         if total > MOST_BYTES:
             path.unlink(missing_ok=True)

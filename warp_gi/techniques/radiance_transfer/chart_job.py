@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import os
+import importlib.util
 import signal
 import subprocess
 import sys
@@ -20,6 +20,14 @@ SHARE = "share"
 """First word of a line of the worker that tells the share that is done."""
 WORKER = Path(__file__).with_name("chart_worker.py")
 """The program."""
+START = """import sys
+sys.path = [path for path in sys.path if path]
+import runpy
+sys.path += [path for path in sys.argv[4:] if path not in sys.path]
+runpy.run_path(sys.argv[1], run_name="__main__")"""
+"""Runs the program that is its first argument, with neither its folder nor the current one among those to import from:
+a file there that is named as a module would be taken for it. Arguments from the fourth on are folders to import from,
+after all others."""
 
 Progress = Callable[[float], None]
 """Called with the share of the work that is done."""
@@ -61,10 +69,9 @@ class ChartJob:
 
 def _worked_off(folder: Path, seconds: float, progress: Progress | None) -> tuple[int, bool, str]:
     """Run the worker on a folder; return its exit code, whether it ran out of time, and its last complaint."""
-    command = [sys.executable, str(WORKER), str(folder), repr(seconds)]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", START, str(WORKER), str(folder), repr(seconds), *_package_folders()]
     pipe = subprocess.PIPE
-    with subprocess.Popen(command, env=environment, stdout=pipe, stderr=pipe, text=True) as process:
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
         complaints: list[str] = []
         listener = threading.Thread(target=lambda: complaints.extend(process.stderr or ()), daemon=True)
         listener.start()
@@ -82,6 +89,13 @@ def _worked_off(folder: Path, seconds: float, progress: Progress | None) -> tupl
             listener.join()
     late = is_late.is_set() or (seconds > 0.0 and code == -getattr(signal, "SIGPROF", 0))
     return code, code != 0 and late, complaints[-1].strip() if complaints else ""
+
+
+def _package_folders() -> list[str]:
+    """Return the folders from which this process imports what the worker needs, which another may not know."""
+    found = (importlib.util.find_spec(name) for name in ("numpy", "xatlas"))
+    folders = [path.parent for path in (Path(one.origin) for one in found if one and one.origin)]
+    return [str(folder.parent if (folder / "__init__.py").is_file() else folder) for folder in folders]
 
 
 @contextlib.contextmanager

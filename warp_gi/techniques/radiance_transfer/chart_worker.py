@@ -1,6 +1,6 @@
 """The program that cuts meshes into charts and packs them by xatlas, in a process of its own that can be stopped.
 
-It is run by its path with a folder, and imports nothing of this package. It reads ``job.npz`` there, writes
+``chart_job.py`` runs it, and it imports nothing of this package. It reads ``job.npz`` there, writes
 ``result.npz``, and prints the share of its work that is done, a line each. ``run`` says what is in them.
 """
 
@@ -26,6 +26,8 @@ UNITS_A_TEXEL = 64.0
 """Units of uv along about a texel, as xatlas gets them to pack: it drops triangles of an area below 1e-7 units^2."""
 NEAR = 0.97
 """Share of the wanted size that a page has to reach."""
+MOST_SIDE = 1 << 30
+"""Side of a page that is larger than any."""
 MOST_PACKS = 10
 """Largest number of times that charts are packed to meet the wanted size."""
 
@@ -52,16 +54,19 @@ def pack(uvs: np.ndarray, charts: np.ndarray, size: int, tell: Callable[[float],
     """Return charts with ``uvs`` [triangle, 3, 2] placed side by side on a page whose longer side is near ``size``.
 
     ``corners`` float32 [triangle, 3, 2] are in texels; ``is_placed`` bool [triangle] is false for those too thin for
-    xatlas; ``page`` int32 [2] is the width and height, or empty if the charts do not fit, however small.
+    xatlas; ``page`` int32 [2] is the width and height, or 0, 0 if the charts do not fit, however small. ``least``
+    int64 is the longer side of the smallest page that any scale needed.
     """
     edges = (uvs[:, 1:] - uvs[:, :1]).astype(np.float64)
     first = size * np.sqrt(0.5 / max(float(0.5 * np.abs(np.linalg.det(edges)).sum()), 1e-30))
     uvs = (uvs * (UNITS_A_TEXEL * first)).astype(np.float32)
     low, high, scale = 0.0, np.inf, 1.0
-    best, best_page = (np.zeros_like(uvs), np.zeros(len(uvs), bool)), np.zeros(0, np.int32)
+    best, best_page = (np.zeros_like(uvs), np.zeros(len(uvs), bool)), np.zeros(2, np.int32)
+    least = MOST_SIDE
     for attempt in range(MOST_PACKS):
         corners, is_placed, page = _packed(uvs, charts, scale / UNITS_A_TEXEL)
         got = max(page)
+        least = min(least, got)
         if got <= size and scale > low:
             low, best, best_page = scale, (corners, is_placed), np.array(page, np.int32)
             if got >= NEAR * size:
@@ -72,7 +77,7 @@ def pack(uvs: np.ndarray, charts: np.ndarray, size: int, tell: Callable[[float],
         if not low < scale < high:
             scale = (low + min(high, 4.0 * low)) / 2.0 if low > 0.0 else high / 2.0
         tell((attempt + 1) / MOST_PACKS)
-    return {"corners": best[0], "is_placed": best[1], "page": best_page}
+    return {"corners": best[0], "is_placed": best[1], "page": best_page, "least": np.array(least, np.int64)}
 
 
 def _packed(uvs: np.ndarray, charts: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
@@ -135,4 +140,4 @@ def main(folder: Path, seconds: float) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), float(sys.argv[2]))
+    main(Path(sys.argv[2]), float(sys.argv[3]))

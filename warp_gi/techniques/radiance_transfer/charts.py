@@ -14,6 +14,8 @@ from warp_gi.techniques.radiance_transfer.islands import equal_rows, islands
 
 TRIANGLE_SIZE = 64.0
 """Root of the mean area of a part's triangles as xatlas gets them: it drops those with an area below 1e-7."""
+STEP = 64
+"""Resolutions that are advised are multiples of it."""
 MOST_FACES = 2048
 """Faces of an island that xatlas cuts at once: its time and memory grow faster than their number."""
 
@@ -164,10 +166,20 @@ def packed(uvs: np.ndarray, charts: np.ndarray, size: int, job: ChartJob, progre
     count = int(charts.max(initial=-1)) + 1
     arrays = {"uvs": uvs, "charts": charts, "size": np.array(size)}
     result = cached("page", arrays, lambda: job.run(arrays, progress))
-    if len(result["page"]) == 0:
-        raise OptionError(
-            f"resolution {size} is too small for the {count:,} charts of this scene; take a larger resolution, or keep"
-            ' transfer at vertices (storage="vertices")'
-        )
+    if not result["page"].any():
+        raise OptionError(_too_many(count, size, int(result["least"])))
     width, height = (int(n) for n in result["page"])
     return Page(result["corners"], np.where(result["is_placed"], charts, -1).astype(np.int32), width, height)
+
+
+def _too_many(count: int, size: int, least: int) -> str:
+    """Return what to do about charts that do not fit on a page of ``size``; the smallest that was tried took ``least``.
+
+    Charts of a texel or two take about that much, however small they are. A page of twice the side has about half of
+    its texels to share out by area.
+    """
+    wanted = -(-2 * least // STEP) * STEP
+    return (
+        f"resolution {size} is too small for the {count:,} charts of this scene: take about {wanted}, give the meshes"
+        ' uv of their own in few charts (charts="own"), or keep transfer at vertices (storage="vertices")'
+    )

@@ -29,6 +29,8 @@ def parse_texel_sets(text: str) -> dict[str, float] | None:
     if text in ("auto", "one"):
         return None if text == "auto" else {}
     factors: dict[str, float] = {}
+    if not isinstance(text, str):
+        raise OptionError(f'texel_sets must be text, "auto", "one", or "NAME=FACTOR,...", got {text!r:.80}')
     for item in text.split(","):
         name, equals, number = (piece.strip() for piece in item.rpartition("="))
         try:
@@ -56,15 +58,19 @@ def density_factors(scene: Scene, texel_sets: str, areas: np.ndarray, counts: np
     factors = parse_texel_sets(texel_sets)
     if factors is None:
         return automatic_factors(areas, counts, texels)
-    nodes = [node.name for node in scene.nodes for _ in node.meshes]
-    meshes = [mesh.name for node in scene.nodes for mesh in node.meshes]
-    for name in factors:
-        if name not in {*nodes, *meshes}:
-            raise unknown_name("node or mesh in texel_sets", name, {*nodes, *meshes})
-    pairs = zip(nodes, meshes, strict=True)
+    check_texel_sets(scene, texel_sets)
+    pairs = [(node.name, mesh.name) for node in scene.nodes for mesh in node.meshes]
     return np.array(
         [factors.get(node, 1.0) * (factors.get(mesh, 1.0) if mesh != node else 1.0) for node, mesh in pairs]
     )
+
+
+def check_texel_sets(scene: Scene, texel_sets: str) -> None:
+    """Raise OptionError for a name that no node with a mesh and no mesh has."""
+    names = {name for node in scene.nodes for mesh in node.meshes for name in (node.name, mesh.name)}
+    for name in parse_texel_sets(texel_sets) or ():
+        if name not in names:
+            raise unknown_name("node or mesh in texel_sets", name, names)
 
 
 def automatic_factors(areas: np.ndarray, counts: np.ndarray, texels: int) -> np.ndarray:

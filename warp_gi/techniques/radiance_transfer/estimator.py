@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import TYPE_CHECKING, Literal
 
 from warp_gi.errors import OptionError, unknown_name
@@ -16,6 +17,7 @@ from warp_gi.scene.baked import whole_scene
 from warp_gi.stateful import Ahead, Service
 from warp_gi.techniques.radiance_transfer.bake import bake_transfer, transfer_key
 from warp_gi.techniques.radiance_transfer.bounces import lamps_move
+from warp_gi.techniques.radiance_transfer.densities import parse_texel_sets
 from warp_gi.techniques.radiance_transfer.settings import TransferSettings
 from warp_gi.techniques.radiance_transfer.sky import SkyLight, TransferLight
 from warp_gi.techniques.radiance_transfer.state import TransferState, transfer_state
@@ -52,7 +54,7 @@ class RadianceTransfer(Estimator, RadianceCache):
     """Where transfer is kept: in texels of an atlas ("texture"), or at the vertices of meshes ("vertices"), as a
     baseline."""
     resolution: int = 1024
-    """Texels along a side of the atlas; several pages share its area."""
+    """Texels along the longer side of the atlas, which is one page; charts leave a few columns or rows unused."""
     texel_sets: str = "auto"
     """Densities of texels: "auto" gives small parts more, "one" is one density for all, "NAME=FACTOR,..." is a factor
     by name of node or mesh."""
@@ -107,6 +109,7 @@ class RadianceTransfer(Estimator, RadianceCache):
         for name, value, known in choices:
             if value not in known:
                 raise unknown_name(name, value, known)
+        parse_texel_sets(self.texel_sets)
         if self.order not in ORDERS:
             raise OptionError(f"order must be 5 or 6, got {self.order}")
         for name, low, high in (
@@ -121,14 +124,14 @@ class RadianceTransfer(Estimator, RadianceCache):
                 raise OptionError(f"{name} must be a whole number from {low} to {high}, got {value!r}")
         if self.rays < self.first_rays:
             raise OptionError(f"rays must be at least first_rays ({self.first_rays}), got {self.rays}")
-        if 0 < self.sun <= 1:
-            raise OptionError(f"sun must be 0 (no suns apart) or a number of means above 1, got {self.sun}")
         if self.term == "indirect" and self.bounces == 0:
             raise OptionError('term "indirect" needs bounces of at least 1, got 0: leave the term out (None)')
         for name in ("chart_seconds", "tolerance", "sun", "ratio_below", "traced_below", "window"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise OptionError(f"{name} must be finite and not negative, got {value}")
+            if not (isinstance(value, Real) and math.isfinite(value) and float(value) >= 0):
+                raise OptionError(f"{name} must be a finite number that is not negative, got {value!r}")
+        if 0 < self.sun <= 1:
+            raise OptionError(f"sun must be 0 (no suns apart) or a number of means above 1, got {self.sun}")
 
     @property
     def transfer_settings(self) -> TransferSettings:

@@ -19,7 +19,7 @@ from warp_gi.baking import Bake
 from warp_gi.errors import OptionError
 from warp_gi.files import replacing
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.radiance_transfer.gltf_export import glb
+from warp_gi.techniques.radiance_transfer.gltf_export import GENERATOR, glb
 from warp_gi.techniques.radiance_transfer.pca import CompressedBounces, compress_bounces
 from warp_gi.techniques.radiance_transfer.textures import LIGHT_NUMBERS, Atlas, TransferTextures, transfer_textures
 from warp_gi.techniques.shared.exr_parts import Part, write_exr_parts
@@ -32,6 +32,8 @@ MASK = ("Y",)
 LAMPS = ("R", "G", "B")
 DIGEST = "warp_gi:bake"
 """Text in the EXR files that names the bake, as the JSON file does: so parts of two exports are told apart."""
+HEAD = 1 << 16
+"""Bytes at the start of a file in which it says by whom it is."""
 
 TEXT = {
     "shade": "Light that a Lambertian surface of reflectance rho reflects, W/(m^2 sr), for each of red, green and "
@@ -106,6 +108,17 @@ def channel_names(prefix: str, count: int) -> tuple[str, ...]:
     return tuple(f"{prefix}.{index:02d}" for index in range(count))
 
 
+def exported_files(path: str | Path) -> dict[str, Path]:
+    """Return the files of an export by what they are called in its description; "description" is the last."""
+    path = Path(path)
+    return {
+        "file": path,
+        "rgba_file": path.with_name(f"{path.stem}.rgba.exr"),
+        "surfaces": path.with_name(f"{path.stem}.glb"),
+        "description": path.with_name(f"{path.stem}.json"),
+    }
+
+
 def check_export_name(path: str | Path) -> None:
     """Raise OptionError unless ``path`` names an .exr file, beside which no file of another's would be overwritten.
 
@@ -114,16 +127,27 @@ def check_export_name(path: str | Path) -> None:
     path = Path(path)
     if path.suffix.lower() != ".exr":
         raise OptionError(f"cannot write {path.name}: transfer textures are .exr files; give NAME.exr")
-    description = path.with_suffix(".json")
-    try:
-        is_ours = json.loads(description.read_text())["format"] == FORMAT if description.is_file() else False
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        is_ours = False
-    for file in (path.with_suffix(".glb"), description):
-        if file.exists() and not is_ours:
+    for file in exported_files(path).values():
+        if file.is_dir():
+            raise OptionError(f"{file}: is a folder; give another name")
+        if file.exists() and not _is_exported(file):
             raise OptionError(
                 f"{file} exists and is not of an earlier export, which would overwrite it: give another name"
             )
+
+
+def _is_exported(file: Path) -> bool:
+    """Return whether a file says that it is of an export."""
+    try:
+        if file.suffix == ".json":
+            return bool(json.loads(file.read_text())["format"] == FORMAT)
+        with open(file, "rb") as opened:
+            head = opened.read(HEAD)
+        if file.suffix == ".glb":
+            return GENERATOR.encode() in head
+        return DIGEST.encode() in head
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return False
 
 
 def page_images(
@@ -200,12 +224,8 @@ def export_textures(bake: Bake, path: str | Path, scene: Scene, components: int 
     images = page_images(textures, compressed)
     largest = max(max(image.size) for image in images)
     warn_if_too_large(path.name, largest, largest, "use a lower resolution")
-    files = {
-        "file": path,
-        "rgba_file": path.with_name(f"{path.stem}.rgba.exr"),
-        "surfaces": path.with_name(f"{path.stem}.glb"),
-    }
-    description = path.with_name(f"{path.stem}.json")
+    files = exported_files(path)
+    description = files.pop("description")
     digest = {DIGEST: bake.digest}
     surfaces = glb(scene, textures.atlas)
     with ExitStack() as stack:  # it renames in reverse: the description last

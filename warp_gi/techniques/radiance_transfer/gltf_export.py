@@ -24,6 +24,8 @@ TEXTURES = {
     "normal_texture": "normalTexture",
     "emission_texture": "emissiveTexture",
 }
+GENERATOR = "warp_gi transfer textures"
+"""What the files say that they were made by."""
 _PNG_LEVEL = 3  # of 9: a third of the time for a twentieth more bytes
 
 
@@ -100,7 +102,7 @@ def glb(scene: Scene, atlas: Atlas) -> bytes:
     A node for each page ("page 0", with the page in its extras), in which there is a primitive for each material;
     faces without a page are in the node "no page". Raises BakeError for an atlas of another scene.
     """
-    writer = _Writer(pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator="warp_gi"), scene=0))
+    writer = _Writer(pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator=GENERATOR), scene=0))
     document = writer.document
     document.materials = [writer.material(material) for material in scene.materials]
     for drawn in drawn_triangles(scene, atlas):

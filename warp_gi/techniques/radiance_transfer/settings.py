@@ -21,7 +21,7 @@ class TransferSettings:
     storage: Literal["texture", "vertices"]
     """Where transfer is kept: in texels of an atlas, or at the vertices of the meshes (the baseline)."""
     resolution: int
-    """Texels along a side of the atlas; several pages share its area."""
+    """Texels along the longer side of the atlas, which is one page; bakes and their readers know several."""
     texel_sets: str
     """Densities of meshes: "auto", "one" density for all, or "NAME=FACTOR,..." by name of node or mesh."""
     charts: Literal["auto", "xatlas", "own"]

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 
-from warp_gi.errors import BakeError
+from warp_gi.errors import BakeError, one_line
 from warp_gi.techniques.radiance_transfer.export import DIGEST, FORMAT, FORMAT_VERSION, SIDES
-from warp_gi.techniques.radiance_transfer.pca import expand_bounces
+from warp_gi.techniques.radiance_transfer.pca import CHANNELS, expand_bounces
 from warp_gi.techniques.radiance_transfer.textures import LIGHT_NUMBERS
 from warp_gi.techniques.shared.exr_parts import read_exr_parts
 
@@ -100,7 +100,8 @@ class TransferFile:
 def read_export(path: str | Path) -> TransferFile:
     """Read exported transfer textures by the path of their JSON file, NAME.json, or of NAME.exr.
 
-    Raises BakeError for files that are missing, torn, of another program, of a newer version, or of two exports.
+    Raises BakeError for files that are missing, torn, of another program, of a newer version, or of two exports; and
+    for parts and channels that are missing, of another size than the description says, or not finite.
     """
     path = Path(path).with_suffix(".json")
     if not path.is_file():
@@ -118,18 +119,65 @@ def read_export(path: str | Path) -> TransferFile:
             f"{path}: is of version {version}, this warp_gi reads up to {FORMAT_VERSION}; update it or export again"
         )
     try:
-        file, wanted = path.parent / info["file"], info["parts"]
+        file = path.parent / _file_name(path, info["file"])
         parts, texts = read_exr_parts(file)
         if texts.get(DIGEST) != info["bake"]:
             raise BakeError(f"{file}: is of another export than {path.name}; export again")
-        images = {
-            (int(part["page"]), SIDES.index(part["side"]), str(part["kind"])): np.stack(
-                [parts[part["name"]][channel] for channel in part["channels"]], axis=-1
-            )
-            for part in wanted
-        }
+        images = dict(_image(file, parts, part) for part in info["parts"])
+        _check_images(info, images)
     except BakeError:
         raise
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise BakeError(f"{path}: does not fit its images ({error}); export again") from error
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, IndexError) as error:
+        problem = f"has no {error}" if isinstance(error, KeyError) else one_line(error)
+        raise BakeError(f"{path}: does not fit its images ({problem}); export again") from error
     return TransferFile(info, images)
+
+
+def _file_name(path: Path, name: object) -> str:
+    """Return the name of a file beside the description; raises BakeError for one that leads elsewhere."""
+    if not isinstance(name, str) or name in ("", ".", "..") or PurePath(name).name != name or "\\" in name:
+        raise BakeError(
+            f"{path}: its images are said to be in {name!r:.80}, expected the name of a file beside it; export again"
+        )
+    return name
+
+
+def _image(
+    file: Path, parts: dict[str, dict[str, np.ndarray]], part: dict[str, Any]
+) -> tuple[tuple[int, int, str], np.ndarray]:
+    """Return page, side and kind of a part of the description, and its image [height, width, channel]."""
+    name, channels = part["name"], part["channels"]
+    if name not in parts:
+        raise BakeError(f"{file}: has no part {name!r:.80}, which its description names; export again")
+    missing = [channel for channel in channels if channel not in parts[name]]
+    if missing:
+        raise BakeError(f"{file}: part {name!r} has no channel {missing[0]!r:.80}; export again")
+    image = np.stack([parts[name][channel] for channel in channels], axis=-1)
+    return (int(part["page"]), SIDES.index(part["side"]), str(part["kind"])), image
+
+
+def _check_images(info: dict[str, Any], images: dict[tuple[int, int, str], np.ndarray]) -> None:
+    """Raise ValueError unless images have the size of their page, the channels of their kind, and a mask."""
+    order, components = int(info["order"]), info.get("components")
+    basis = np.array(components["basis"], np.float64) if components else np.zeros((CHANNELS, CHANNELS))
+    if basis.ndim != 2 or basis.shape[1] != CHANNELS or not np.isfinite(basis).all():
+        raise ValueError(f"the basis of its components is not of {CHANNELS} finite numbers each")
+    counts = {"mask": 1, "transfer": order * order, "bounces": len(basis), "lamps": 3}
+    sizes = [(int(page["height"]), int(page["width"])) for page in info["pages"]]
+    for (page, side, kind), image in images.items():
+        name = f"page{page}.{SIDES[side]}.{kind}"
+        if not 0 <= page < len(sizes):
+            raise ValueError(f"{name} is of none of its {len(sizes)} pages")
+        if kind not in counts:
+            raise ValueError(f"{name} is of no kind that is known ({', '.join(counts)})")
+        wanted = (*sizes[page], counts[kind])
+        if image.shape != wanted:
+            got, expected = (" x ".join(map(str, (shape[1], shape[0], shape[2]))) for shape in (image.shape, wanted))
+            raise ValueError(f"{name} has {got} numbers, expected {expected}: width x height x channels")
+        for needed in ("mask", "transfer"):
+            if (page, side, needed) not in images:
+                raise ValueError(f"there is no part page{page}.{SIDES[side]}.{needed}")
+        if not np.isfinite(image).all():
+            raise ValueError(f"{name} has numbers that are not finite")
+        if kind == "mask" and not ((image == 0) | (image == 1)).all():
+            raise ValueError(f"{name} has numbers other than 0 and 1")
