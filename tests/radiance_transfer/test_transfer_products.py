@@ -11,8 +11,8 @@ from scipy.special import lpmv
 from statistics_tools import device, every_device  # noqa: F401
 
 from warp_gi import launch
-from warp_gi.kernels import transfer_products
 from warp_gi.kernels.transfer_products import WIDTHS, bounced_product, environment_product, glossy_product, vec6
+from warp_gi.kernels.transfer_snippets import clamped_cosine
 
 wp.set_module_options({"enable_backward": False})
 
@@ -112,7 +112,7 @@ def test_products_are_those_of_numpy(order):
     about_n = np.pad(normal_lobe, ((0, 0), (1, 1)))
     product = np.einsum("pk,kci->pci", lobe[:, bands] * y + about_n[:, bands] * y_normal, matrix.astype(np.float64))
     shaded = np.einsum("pci,pi->pc", product[..., :count], blend[:, :count])
-    unshaded = y_normal * np.array(transfer_products.clamped_cosine(order))[bands]
+    unshaded = y_normal * np.array(clamped_cosine(order))[bands]
     np.testing.assert_allclose(out.numpy()[:, 3:6], shaded, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(
         out.numpy()[:, 6:9], np.einsum("pci,pi->pc", product[..., :count], unshaded), rtol=1e-4, atol=1e-4

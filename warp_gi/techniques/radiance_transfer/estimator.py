@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.kernels import path_trace, transfer_light, transfer_shade
-from warp_gi.kernels.transfer_products import ORDERS
+from warp_gi.kernels.transfer_snippets import ORDERS
 from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import whole_scene
 from warp_gi.stateful import Ahead, Service

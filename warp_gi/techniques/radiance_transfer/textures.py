@@ -10,11 +10,10 @@ import warp as wp
 from warp_gi.baking import Bake
 from warp_gi.errors import BakeError
 from warp_gi.kernels.transfer_atlas import TransferAtlas
+from warp_gi.kernels.transfer_snippets import LIGHT_NUMBERS
 from warp_gi.launch import on_device
 
 TECHNIQUE = "RadianceTransfer"
-LIGHT_NUMBERS = 25
-"""Coefficients of the sky a channel, and so of what bounces (order 5)."""
 
 
 @dataclass(frozen=True, eq=False)
