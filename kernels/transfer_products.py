@@ -57,8 +57,9 @@ _ENVIRONMENT = (
             result[c] = total(product);
         }
     };
-    if (width == 32) run(Four()); else run(Five());
+    if (transfer.shape[1] == 32) run(Four()); else run(Five());
 #else
+    const int width = transfer.shape[1];
     for (int k = 0; k < 4; ++k) {
         if (shares[k] == 0.0f) continue;
         const wp::half* row = transfer.data + (size_t)slots[k] * width;
@@ -148,9 +149,9 @@ _GLOSSY = (
             result[3 + c] = total(open);
         }
     };
-    if (width == 32) run(Four()); else run(Five());
+    if (transfer.shape[1] == 32) run(Four()); else run(Five());
 #else
-    const int order = width == 32 ? 5 : 6;
+    const int width = transfer.shape[1], order = width == 32 ? 5 : 6;
     float about[40] = {}, up[40] = {}, sum[40] = {};
     functions(normal, order, up);
     functions(direction, order, about);
@@ -179,21 +180,20 @@ _GLOSSY = (
 )
 
 
-# Light that arrives through a blend of rows `slots`, by `light` [3, width].
+# Light that arrives through a blend of rows `slots` of transfer [slot, width], by `light` [3, width].
 @wp.func_native(snippet=_ENVIRONMENT)
 def environment_product(
-    transfer: wp.array(dtype=wp.float16),
-    width: wp.int32,
+    transfer: wp.array2d(dtype=wp.float16),
     slots: wp.vec4i,
     shares: wp.vec4,
     light: wp.array(dtype=wp.float32),
 ) -> wp.vec3: ...
 
 
-# Light that arrives over other surfaces, by rows of red, green and blue, and `light` [3, 32].
+# Light that arrives over other surfaces, by rows [slot, 3 * 32] of red, green and blue, and `light` [3, 32].
 @wp.func_native(snippet=_BOUNCED)
 def bounced_product(
-    bounces: wp.array(dtype=wp.float16), slots: wp.vec4i, shares: wp.vec4, light: wp.array(dtype=wp.float32)
+    bounces: wp.array2d(dtype=wp.float16), slots: wp.vec4i, shares: wp.vec4, light: wp.array(dtype=wp.float32)
 ) -> wp.vec3: ...
 
 
@@ -201,8 +201,7 @@ def bounced_product(
 # shaded the point. `matrix` is [k, channel, width].
 @wp.func_native(snippet=_GLOSSY)
 def glossy_product(
-    transfer: wp.array(dtype=wp.float16),
-    width: wp.int32,
+    transfer: wp.array2d(dtype=wp.float16),
     slots: wp.vec4i,
     shares: wp.vec4,
     matrix: wp.array(dtype=wp.float32),

@@ -36,9 +36,8 @@ def basis(directions, order):
 @wp.kernel
 def products(
     first: wp.int32,
-    rows: wp.array(dtype=wp.float16),
-    bounces: wp.array(dtype=wp.float16),
-    width: wp.int32,
+    rows: wp.array2d(dtype=wp.float16),
+    bounces: wp.array2d(dtype=wp.float16),
     light: wp.array(dtype=wp.float32),
     matrix: wp.array(dtype=wp.float32),
     points: wp.array(dtype=wp.float32),
@@ -57,8 +56,8 @@ def products(
     direction = wp.vec3(points[at + 14], points[at + 15], points[at + 16])
     normal = wp.vec3(points[at + 17], points[at + 18], points[at + 19])
     normal_lobe = wp.vec4(points[at + 20], points[at + 21], points[at + 22], points[at + 23])
-    a = environment_product(rows, width, slots, shares, light)
-    b = glossy_product(rows, width, slots, shares, matrix, direction, lobe, normal, normal_lobe)
+    a = environment_product(rows, slots, shares, light)
+    b = glossy_product(rows, slots, shares, matrix, direction, lobe, normal, normal_lobe)
     d = bounced_product(bounces, slots, shares, light)
     for c in range(3):
         out[i, c] = a[c]
@@ -93,9 +92,8 @@ def test_products_are_those_of_numpy(order):
     at = device()
     out = wp.zeros((POINTS, 12), dtype=wp.float32, device=at)
     arrays = [
-        wp.array(transfer.ravel(), dtype=wp.float16, device=at),
-        wp.array(bounces.ravel(), dtype=wp.float16, device=at),
-        width,
+        wp.array(transfer, dtype=wp.float16, device=at),
+        wp.array(bounces.reshape(SLOTS, 96), dtype=wp.float16, device=at),
         wp.array(light.ravel(), dtype=wp.float32, device=at),
         wp.array(matrix.ravel(), dtype=wp.float32, device=at),
         wp.array(points.ravel(), dtype=wp.float32, device=at),

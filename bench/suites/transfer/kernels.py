@@ -59,7 +59,7 @@ _SPARSE = (
 
 @wp.func_native(snippet=_SPARSE)
 def sparse_product(
-    transfer: wp.array(dtype=wp.float16),
+    transfer: wp.array2d(dtype=wp.float16),
     slots: wp.vec4i,
     shares: wp.vec4,
     light: wp.array(dtype=wp.float32),
@@ -92,7 +92,7 @@ class ProductVertices:
 
 @wp.func
 def product(
-    transfer: wp.array(dtype=wp.float16),
+    transfer: wp.array2d(dtype=wp.float16),
     slots: wp.vec4i,
     shares: wp.vec4,
     query: ProductQuery,
@@ -102,7 +102,7 @@ def product(
     direction = 2.0 * wp.dot(normal, view) * normal - view
     if query.form == TPFL:
         none = wp.vec4(0.0, 0.0, 0.0, 0.0)
-        p = glossy_product(transfer, 32, slots, shares, query.matrix, direction, query.lobe, normal, none)
+        p = glossy_product(transfer, slots, shares, query.matrix, direction, query.lobe, normal, none)
         return wp.vec3(p[0], p[1], p[2])
     q = query
     return sparse_product(transfer, slots, shares, q.light, direction, q.lobe, q.terms, q.values, q.form)
@@ -138,7 +138,7 @@ def evaluate_pixels(
 @wp.kernel(enable_backward=False)
 def evaluate_vertices(
     first: wp.int32,
-    transfer: wp.array(dtype=wp.float16),
+    transfer: wp.array2d(dtype=wp.float16),
     query: ProductQuery,
     vertices: ProductVertices,
     colors: wp.array(dtype=wp.vec3),
