@@ -181,6 +181,53 @@ def test_sharp_lobes_are_traced(roughness):
         assert frame.numpy(term)[seen].mean() == pytest.approx(truth.numpy(term)[seen].mean(), rel=bound), term
 
 
+@pytest.mark.filterwarnings("ignore:environment. 1 small lamps")
+def test_mirrored_suns_are_as_soft():
+    """A mirror shows the penumbra of a wide sun, as paths do; with points for suns it shows a hard shadow."""
+    pixels = np.full((32, 64, 3), 0.1, np.float32)
+    pixels[5:8, 9:12] = 200.0
+    mirror = gi.Material("mirror", (0.9, 0.9, 0.9), metallic=1.0, roughness=0.02)
+    meshes = [
+        quad((-2, 0, 2), (4, 0, 0), (0, 0, -4), GREY, "floor"),
+        quad((-0.5, 1, 0.5), (1, 0, 0), (0, 0, -1), GREY, "card"),
+        quad((-2, 0, -2), (4, 0, 0), (0, 2, 0), mirror, "mirror"),
+    ]
+    scene = gi.Scene([gi.Node(mesh.name, [mesh]) for mesh in meshes], environment=gi.Environment(pixels=pixels))
+    bake = gi.bake(scene, DIRECT, st.device().alias)
+    truth = rendered(scene, gi.Pipeline(spp=1024, emitters=None)).numpy("indirect")
+    pictures = []
+    for soft in (True, False):
+        direct, indirect = (replace(one, soft_suns=soft) for one in (DIRECT, INDIRECT))
+        frame = rendered(scene, pipeline(environment=direct, indirect=indirect, spp=64), bakes=[bake])
+        pictures.append(frame.numpy("indirect"))
+    mirrored = (frame.numpy("object_id") == 2)[..., None]
+    penumbra = mirrored & (abs(pictures[0] - pictures[1]) > 0.15)
+    errors = [abs(picture - truth)[penumbra].mean() for picture in pictures]
+    assert penumbra.sum() > 40 and errors[0] < 0.5 * errors[1], (penumbra.sum(), errors)
+
+
+@pytest.mark.parametrize("lost", ["pages", "texels"])
+def test_surfaces_without_slots_are_traced(lost):
+    """Matt and at rest, with nothing else in the scene that needs a ray."""
+    scene = corner(sky_of(slope))
+    bake = gi.bake(scene, DIRECT, st.device().alias)
+    assert not DIRECT.start(scene, st.device().alias, bake).needs_rays
+    wall = np.flatnonzero(scene._flat.materials == [one.name for one in scene.materials].index("red"))
+    arrays = {name: array.copy() for name, array in bake.arrays.items()}
+    if lost == "pages":
+        arrays["atlas_face_pages"][wall] = -1
+    else:
+        slots = arrays["atlas_slots"]
+        slots[(slots >= 0) & np.isin(arrays["atlas_slot_faces"][slots], wall)] = -1
+    without = gi.Bake(bake.technique, bake.scene_key, bake.settings, arrays, bake.counts, bake.scene_name)
+    frame, truth = rendered(scene, pipeline(spp=64), bakes=[without]), rendered(scene, gi.Pipeline(spp=512))
+    seen = truth.numpy("material_id") == frame.numpy("material_id")
+    seen &= truth.numpy("albedo")[..., 0] > 5 * truth.numpy("albedo")[..., 1]
+    assert seen.sum() > 100
+    for term in ("environment", "indirect"):
+        assert frame.numpy(term)[seen].mean() == pytest.approx(truth.numpy(term)[seen].mean(), rel=0.03), term
+
+
 @pytest.mark.parametrize(("roughness", "bound"), [(0.8, 0.06), (0.6, 0.12)])
 def test_glossy_lobes_by_transfer(roughness, bound):
     """Under a sky of few numbers, direct light of a rough metal is near the truth."""

@@ -115,3 +115,33 @@ def test_products_are_those_of_numpy(order):
     np.testing.assert_allclose(
         out.numpy()[:, 6:9], np.einsum("pci,pi->pc", product[..., :count], unshaded), rtol=1e-4, atol=1e-4
     )
+
+
+def test_rows_past_two_thousand_million_numbers():
+    """The same memory as the end of arrays that begin far before it, which nobody reads: indices need 64 bits."""
+    rng, at, far = np.random.default_rng(1), device(), 1 << 26
+    points = np.zeros((POINTS, 24), np.float32)
+    points[:, :4] = 8 * rng.integers(0, SLOTS, (POINTS, 4))  # whole numbers of float32 behind `far`, too
+    points[:, 4:] = rng.normal(size=(POINTS, 20))
+    rows, bounces = (
+        wp.array(rng.normal(size=(8 * SLOTS, width)), dtype=wp.float16, device=at) for width in (WIDTHS[5], 96)
+    )
+    light = wp.array(rng.normal(size=96), dtype=wp.float32, device=at)
+    matrix = wp.array(rng.normal(size=25 * 96), dtype=wp.float32, device=at)
+    found = []
+    for start in (0, far):
+        points[:, :4] += start
+        arrays = [
+            wp.array(
+                ptr=one.ptr - start * one.strides[0],
+                shape=(start + one.shape[0], one.shape[1]),
+                dtype=wp.float16,
+                device=at,
+            )
+            for one in (rows, bounces)
+        ]
+        out = wp.zeros((POINTS, 12), dtype=wp.float32, device=at)
+        inputs = [*arrays, light, matrix, wp.array(points.ravel(), dtype=wp.float32, device=at), out]
+        launch.launch(products, POINTS, inputs, at)
+        found.append(out.numpy())
+    assert abs(found[0]).min(axis=0).max() > 0 and (found[0] == found[1]).all()
