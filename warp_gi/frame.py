@@ -21,7 +21,6 @@ from warp_gi.scene.camera import Camera
 from warp_gi.scene.pinhole import camera_data
 
 if TYPE_CHECKING:
-    from warp_gi.estimator import Estimator
     from warp_gi.scene.scene import Scene
 
 TERMS = ("environment", "emitters", "indirect")
@@ -92,7 +91,7 @@ class Frame:
         """Values by name that decide the pixels, beside camera and time."""
         self.paths = PathRequest(data.emitters)
         """Requests of estimators to the path tracer."""
-        self.estimators: dict[str, Estimator] = {}
+        self.estimators: dict[str, object] = {}
         """Estimators of the pipeline by their terms; a class that serves several finds its others here."""
         self.sky_probability = sky_probability(scene)
         """Probability of sampling the sky where a path vertex samples either the sky or an emitter."""

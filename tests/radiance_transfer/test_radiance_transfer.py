@@ -266,6 +266,10 @@ def test_lamps_that_move_are_refused_with_what_to_take_instead():
     scene.animate("lamp", [gi.Keyframe(0.0, (0, 0.9, 0)), gi.Keyframe(1.0, (0, 0.9, 0.4))])
     with pytest.raises(gi.OptionError, match=r"lamps of this scene move.*BsdfPaths\(ends_in=RadianceTransfer"):
         rendered(scene, pipeline(environment=None))
+    with pytest.warns(UserWarning, match="knows nothing of what moves"):
+        bake = gi.bake(scene, DIRECT, st.device().alias)  # which direct light may take
+    with pytest.raises(gi.OptionError, match="lamps of this scene move"):
+        rendered(scene, pipeline(environment=None), bakes=[bake])
 
 
 def test_a_sky_of_lamps_warns():

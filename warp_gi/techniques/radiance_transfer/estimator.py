@@ -15,7 +15,7 @@ from warp_gi.kernels import path_trace, transfer_light, transfer_shade
 from warp_gi.kernels.transfer_snippets import ORDERS
 from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import whole_scene
-from warp_gi.stateful import Ahead, Service
+from warp_gi.stateful import Service
 from warp_gi.techniques.radiance_transfer.bake import bake_transfer, transfer_key
 from warp_gi.techniques.radiance_transfer.bounces import lamps_move
 from warp_gi.techniques.radiance_transfer.settings import TransferSettings
@@ -188,10 +188,6 @@ class RadianceTransfer(Estimator, RadianceCache):
             )
 
     # ---- frames ----
-
-    def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
-        """Return False: the bake is all that is kept, and the sky is the frame's own."""
-        return False
 
     def give(self, frame: Frame, state: TransferState) -> None:
         """Let paths end in what is known of light that was reflected before."""
