@@ -75,6 +75,7 @@ TRANSFER_RAY_DIMENSION = wp.constant(4)  # ray that may find a lamp
 # Pixels lit by transfer textures, beside paths from there and from what their rays meet.
 TRANSFER_LOBE_DIMENSION = wp.constant(2004)  # the ray of a sharp lobe
 TRANSFER_SUN_DIMENSION = wp.constant(2005)  # the place on the discs of suns, by camera sample
+TRANSFER_HIT_SUN_DIMENSION = wp.constant(2006)  # and for what the ray of a sharp lobe meets
 
 # Pixels lit by a visibility field.
 FIELD_BSDF_DIMENSION = wp.constant(101)  # the direction by the BSDF; random: which of these samples are verified

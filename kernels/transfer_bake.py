@@ -33,7 +33,8 @@ wp.set_module_options({"enable_backward": False})
 
 SETS = wp.constant(64)  # of directions
 SKY = wp.constant(-1)  # a ray that hits nothing
-BLACK = wp.constant(-2)  # a ray that hits what keeps no transfer, or starts below the surface
+BLACK = wp.constant(-2)  # a ray that hits what keeps no transfer
+BELOW = wp.constant(-3)  # a ray that starts below the surface
 
 
 # Where the slots are: see warp_gi/techniques/radiance_transfer/textures.py.
@@ -59,7 +60,7 @@ class TransferRays:
 @wp.struct
 class TransferResults:
     transfer: wp.array2d(dtype=wp.float16)  # [slot, order^2] sr
-    hits: wp.array2d(dtype=wp.int32)  # [slot, bounce_rays] slot that the ray hits, SKY or BLACK
+    hits: wp.array2d(dtype=wp.int32)  # [slot, bounce_rays] slot that the ray hits, SKY, BLACK or BELOW
     rays: wp.array(dtype=wp.int32)  # [slot] rays traced
 
 
@@ -142,7 +143,7 @@ def free_rays(
     free = wp.uint64(0)
     for i in range(count):
         direction = ray_direction(rays, frame, item + i)
-        target = int(BLACK)
+        target = int(BELOW)
         if wp.dot(direction, s.normal) > 0.0:
             if begin + i < rays.bounce_rays:
                 target = hit_slot(scene, atlas, rays, origin, direction)

@@ -6,7 +6,8 @@ from warp_gi.kernels.bsdf import average_reflectance
 from warp_gi.kernels.surface import surface_at
 from warp_gi.kernels.transfer_atlas import BACK, TransferAtlas
 from warp_gi.kernels.transfer_bake import TransferRays, TransferSlots, ray_direction, set_frame, set_start, slot_surface
-from warp_gi.kernels.transfer_native import LIGHT_NUMBERS, Numbers, gather_row, harmonics_at
+from warp_gi.kernels.transfer_native import Numbers, gather_row, harmonics_at
+from warp_gi.kernels.transfer_snippets import LIGHT_NUMBERS, LIGHT_ORDER
 from warp_gi.kernels.types import SceneData
 
 wp.set_module_options({"enable_backward": False})
@@ -124,7 +125,7 @@ def gather_glossy(
     blue = Numbers()
     for i in range(hits.shape[1]):
         if hits[slot, i] >= 0:
-            y = harmonics_at(ray_direction(rays, frame, item + i), 5)
+            y = harmonics_at(ray_direction(rays, frame, item + i), LIGHT_ORDER)
             light = radiance[hits[slot, i]] * (wp.pi / wp.float32(hits.shape[1]))
             red += y * light[0]
             green += y * light[1]

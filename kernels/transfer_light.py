@@ -36,9 +36,8 @@ MOST_SHARE = wp.constant(wp.float32(1.5))  # of the light of an open lobe
 @wp.struct
 class TransferRows:
     atlas: TransferAtlas
-    width: wp.int32  # numbers in a row of `transfer`: 32 or 40
-    transfer: wp.array(dtype=wp.float16)  # [slot * width]
-    bounces: wp.array(dtype=wp.float16)  # [slot * 3 * 32]; empty without bounces
+    transfer: wp.array2d(dtype=wp.float16)  # [slot, width], of width 32 or 40
+    bounces: wp.array2d(dtype=wp.float16)  # [slot, 3 * 32]; empty without bounces
     lamps: wp.array(dtype=wp.vec3)  # [slot] W/m^2 by lamps over other surfaces; empty without
 
 
@@ -97,7 +96,7 @@ def sun_radiance(scene: SceneData, sky: TransferSky, s: Surface, b: Bsdf, wo: wp
 # Radiance of the sky, without suns, that a diffuse lobe reflects. A sum of few harmonics may be below 0.
 @wp.func
 def diffuse_radiance(rows: TransferRows, sky: TransferSky, s: Surface, at: SlotFetch) -> wp.vec3:
-    irradiance = environment_product(rows.transfer, rows.width, at.slots, at.shares, sky.light)
+    irradiance = environment_product(rows.transfer, at.slots, at.shares, sky.light)
     return wp.cw_mul(wp.cw_mul(diffuse_share(s.bsdf), s.bsdf.diffuse), irradiance) / wp.pi
 
 
@@ -119,7 +118,6 @@ def glossy_radiance(
     lobe = lobe_at(sky.lobes, shading, normal, view)
     products = glossy_product(
         rows.transfer,
-        rows.width,
         at.slots,
         at.shares,
         sky.matrix,
@@ -132,7 +130,7 @@ def glossy_radiance(
     if roughness < ratio_below:
         open = unshaded_radiance(sky.lobes, sky.prefiltered, sky.environment_from_world, place, normal, view)
         for c in range(3):
-            least = LEAST_OF_MEAN * MEAN_OF_FIRST * sky.light[c * rows.width]
+            least = LEAST_OF_MEAN * MEAN_OF_FIRST * sky.light[c * rows.transfer.shape[1]]
             share = wp.clamp(light[c] / wp.max(products[3 + c], wp.max(least, 1.0e-20)), 0.0, MOST_SHARE)
             light[c] = open[c] * sky.scale * share
     offset = s.bsdf.f90 * table_entry(sky.lobes.entries, place, 3)

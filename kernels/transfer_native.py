@@ -4,93 +4,24 @@ On the CPU it works on eight numbers at a time in clang's portable vector types,
 converts them; CUDA, and other processors, run the same formulas one number at a time.
 """
 
-import math
-
 import warp as wp
+
+from warp_gi.kernels.transfer_snippets import COSINE, HARMONICS, HAS_VECTOR_HALVES, MOST_NUMBERS
 
 wp.set_module_options({"enable_backward": False})
 
-MOST_NUMBERS = 36  # order 6
-LIGHT_NUMBERS = wp.constant(25)
 ROW_NUMBERS = 80  # a row of bounces: three channels of 25 numbers, and five zeros
 BLOCK_RAYS = wp.constant(64)  # rays whose visibility one word holds
 Numbers = wp.types.vector(length=MOST_NUMBERS, dtype=wp.float32)
 
 
-def _factor(degree: int, power: int) -> float:
-    ratio = math.factorial(degree - power) / math.factorial(degree + power)
-    return math.sqrt((2 * degree + 1) / (4 * math.pi) * ratio * (1 if power == 0 else 2))
-
-
-# d^m P_l / dz^m of the Legendre polynomials, by degree l and order m: harmonics divided by their factor and by
-# Re or Im (x + i y)^m.
-_POLYNOMIALS = {
-    (0, 0): "one",
-    (1, 0): "z",
-    (1, 1): "one",
-    (2, 0): "0.5f * (3.0f * z2 - 1.0f)",
-    (2, 1): "3.0f * z",
-    (2, 2): "3.0f * one",
-    (3, 0): "0.5f * z * (5.0f * z2 - 3.0f)",
-    (3, 1): "1.5f * (5.0f * z2 - 1.0f)",
-    (3, 2): "15.0f * z",
-    (3, 3): "15.0f * one",
-    (4, 0): "0.125f * ((35.0f * z2 - 30.0f) * z2 + 3.0f)",
-    (4, 1): "2.5f * z * (7.0f * z2 - 3.0f)",
-    (4, 2): "7.5f * (7.0f * z2 - 1.0f)",
-    (4, 3): "105.0f * z",
-    (4, 4): "105.0f * one",
-    (5, 0): "0.125f * z * ((63.0f * z2 - 70.0f) * z2 + 15.0f)",
-    (5, 1): "1.875f * ((21.0f * z2 - 14.0f) * z2 + 1.0f)",
-    (5, 2): "52.5f * z * (3.0f * z2 - 1.0f)",
-    (5, 3): "52.5f * (9.0f * z2 - 1.0f)",
-    (5, 4): "945.0f * z",
-    (5, 5): "945.0f * one",
-}
-
-
-def _degree(degree: int) -> str:
-    lines = []
-    for power in range(degree + 1):
-        center = degree * degree + degree
-        name = f"p{degree}{power}"
-        lines.append(f"const auto {name} = {_factor(degree, power)!r}f * ({_POLYNOMIALS[degree, power]});")
-        if power == 0:
-            lines.append(f"add({center}, {name});")
-        else:
-            lines.append(f"add({center + power}, {name} * c{power});")
-            lines.append(f"add({center - power}, {name} * s{power});")
-    return "\n        ".join(lines)
-
-
-# Hands each real spherical harmonic at a unit direction to `add(index, value)`: 25 of them, or 36 where order > 5.
-# Index l^2 + l + m, orthonormal, without the Condon-Shortley sign, polar axis z, as kernels/harmonics.py.
-_HARMONICS = """
-    auto harmonics = [](auto x, auto y, auto z, int order, auto add) {
-        #pragma clang fp contract(fast)
-        const auto one = z * 0.0f + 1.0f, z2 = z * z;
-        const auto c1 = x, s1 = y;
-        const auto c2 = x * c1 - y * s1, s2 = x * s1 + y * c1;
-        const auto c3 = x * c2 - y * s2, s3 = x * s2 + y * c2;
-        const auto c4 = x * c3 - y * s3, s4 = x * s3 + y * c3;
-        LOW
-        if (order <= 5) return;
-        const auto c5 = x * c4 - y * s4, s5 = x * s4 + y * c4;
-        HIGH
-    };
-"""
-_HARMONICS = _HARMONICS.replace("LOW", "\n        ".join(_degree(degree) for degree in range(5)))
-_HARMONICS = _HARMONICS.replace("HIGH", _degree(5))
-_PRAGMA = "#pragma clang fp contract(fast)"
-_PORTABLE_HARMONICS = _HARMONICS.replace(_PRAGMA, "")
-
-
 # Sums of the harmonics over those of `count` (at most 64) directions from `start` on whose bits are set in `chosen`.
 # directions [axis, item] are local, and have eight items more than anyone asks for; `frame` is world_from_local.
 @wp.func_native(
-    snippet="wp::vec_t<36, float> result;\n#if defined(__CUDA_ARCH__)\n"
-    + _PORTABLE_HARMONICS
+    snippet="wp::vec_t<36, float> result;\n"
+    + HARMONICS
     + """
+#if defined(__CUDA_ARCH__)
     const int stride = directions.strides[0] / (int)sizeof(float);
     for (int i = 0; i < count; ++i) {
         if (!((chosen >> i) & 1ull)) continue;
@@ -99,9 +30,6 @@ _PORTABLE_HARMONICS = _HARMONICS.replace(_PRAGMA, "")
         harmonics(d[0], d[1], d[2], order, [&](int k, float value) { result[k] += value; });
     }
 #else
-"""
-    + _HARMONICS
-    + """
     typedef float f8 __attribute__((vector_size(32)));
     typedef int i8 __attribute__((vector_size(32)));
     const int stride = directions.strides[0] / (int)sizeof(float);
@@ -141,7 +69,7 @@ def harmonic_sums(
 
 # The harmonics at one direction.
 @wp.func_native(
-    snippet=_PORTABLE_HARMONICS
+    snippet=HARMONICS
     + """
     wp::vec_t<36, float> result;
     harmonics(d[0], d[1], d[2], order, [&](int k, float value) { result[k] = value; });
@@ -151,22 +79,18 @@ def harmonic_sums(
 def harmonics_at(d: wp.vec3, order: wp.int32) -> Numbers: ...
 
 
-# Transfer where nothing is in the way: A_l y(n), A = pi, 2 pi/3, pi/4, 0, -pi/24, 0.
-@wp.func
-def open_transfer(n: wp.vec3, order: wp.int32) -> Numbers:
-    y = harmonics_at(n, order)
-    y[0] = y[0] * wp.pi
-    for k in range(1, 4):
-        y[k] = y[k] * (2.0 * wp.pi / 3.0)
-    for k in range(4, 9):
-        y[k] = y[k] * (wp.pi / 4.0)
-    for k in range(9, 16):
-        y[k] = 0.0
-    for k in range(16, 25):
-        y[k] = y[k] * (-wp.pi / 24.0)
-    for k in range(25, 36):
-        y[k] = 0.0
-    return y
+# Transfer where nothing is in the way: A_l y(n).
+@wp.func_native(
+    snippet=HARMONICS
+    + COSINE
+    + """
+    wp::vec_t<36, float> result;
+    harmonics(n[0], n[1], n[2], order, [&](int k, float value) { result[k] = value; });
+    for (int l = 0, k = 0; l < order; ++l) for (int m = 0; m < 2 * l + 1; ++m, ++k) result[k] *= cosine[l];
+    return result;
+"""
+)
+def open_transfer(n: wp.vec3, order: wp.int32) -> Numbers: ...
 
 
 @wp.func_native(
@@ -181,9 +105,6 @@ def open_transfer(n: wp.vec3, order: wp.int32) -> Numbers:
 def bit_count(word: wp.uint64) -> wp.int32: ...
 
 
-_VECTOR_HALVES = "!defined(__CUDA_ARCH__) && (defined(__F16C__) || defined(__aarch64__))"
-
-
 # Gathers at a slot what its hits reflect, the mean of rows [slot, 80] over hits [slot, ray], with nothing from those
 # below 0. Writes it to bounces [slot, 75], and what the slot reflects of it and of direct light itself to next.
 # Returns the means of the first number of each channel.
@@ -192,7 +113,7 @@ _VECTOR_HALVES = "!defined(__CUDA_ARCH__) && (defined(__F16C__) || defined(__aar
     float mean[80] = {{}};
     const int* hit = hits.data + (long long)slot * hits.shape[1];
     const float scale = count ? 1.0f / (float)count : 0.0f;
-#if {_VECTOR_HALVES}
+#if {HAS_VECTOR_HALVES}
     typedef float f8 __attribute__((vector_size(32)));
     typedef _Float16 h8 __attribute__((vector_size(16)));
     f8 sums[10] = {{}};
@@ -224,7 +145,7 @@ _VECTOR_HALVES = "!defined(__CUDA_ARCH__) && (defined(__F16C__) || defined(__aar
     for (int k = 0; k < 75; ++k) reflected[k] = albedo[k / 25] * ((float)direct[k % 25] + mean[k]);
     auto* kept = bounces.data + (long long)slot * 75;
     auto* target = next.data + (long long)slot * 80;
-#if {_VECTOR_HALVES}
+#if {HAS_VECTOR_HALVES}
     h8 halves[10];
     for (int k = 0; k < 10; ++k) {{
         f8 value;

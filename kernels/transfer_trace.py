@@ -18,7 +18,13 @@ from warp_gi.kernels.path_trace import (
     PathSettings,
     path_tracer,
 )
-from warp_gi.kernels.sampling import TRANSFER_LOBE_DIMENSION, pixel_sample_index, pixel_seed, sample_2d
+from warp_gi.kernels.sampling import (
+    TRANSFER_HIT_SUN_DIMENSION,
+    TRANSFER_LOBE_DIMENSION,
+    pixel_sample_index,
+    pixel_seed,
+    sample_2d,
+)
 from warp_gi.kernels.surface import Surface, ray_origin, surface_at
 from warp_gi.kernels.transfer_atlas import SlotFetch
 from warp_gi.kernels.transfer_light import (
@@ -49,7 +55,6 @@ TransferSamplers = TRACER.samplers
 trace_path = TRACER.trace_path
 
 UP = wp.constant(wp.vec3(0.0, 0.0, 1.0))
-NO_POINT = wp.constant(wp.vec2(0.0, 0.0))
 
 
 # Light of one sample.
@@ -59,7 +64,7 @@ class TracedLight:
     indirect: wp.vec3
 
 
-# Radiance that leaves what a ray meets: light of the sky and of lamps that was reflected there.
+# Radiance that leaves what a ray meets: light of the sky and of lamps that was reflected there. Suns are discs if soft.
 @wp.func
 def leaving_radiance(
     scene: SceneData,
@@ -67,6 +72,7 @@ def leaving_radiance(
     paths: PathSettings,
     hit: BvhHit,
     direction: wp.vec3,
+    soft: wp.int32,
     index: wp.uint32,
     seed: wp.uint32,
 ) -> wp.vec3:
@@ -84,11 +90,14 @@ def leaving_radiance(
         return light
     sky = samplers.cache.sky
     rows = samplers.cache.rows
-    irradiance = wp.max(environment_product(rows.transfer, rows.width, at.slots, at.shares, sky.light), wp.vec3())
+    irradiance = wp.max(environment_product(rows.transfer, at.slots, at.shares, sky.light), wp.vec3())
     irradiance = irradiance + bounced_irradiance(rows, sky, at)
     light = light + wp.cw_mul(average_reflectance(s.bsdf), irradiance) / wp.pi
     if sky.sun_count > 0:
-        light = light + sun_radiance(scene, sky, s, lambert(average_reflectance(s.bsdf)), UP, NO_POINT)
+        u = wp.vec2(0.0, 0.0)
+        if soft != 0:
+            u = sample_2d(index, seed, TRANSFER_HIT_SUN_DIMENSION)
+        light = light + sun_radiance(scene, sky, s, lambert(average_reflectance(s.bsdf)), UP, u)
     return light
 
 
@@ -100,6 +109,7 @@ def lobe_light(
     paths: PathSettings,
     s: Surface,
     wo: wp.vec3,
+    soft: wp.int32,
     index: wp.uint32,
     seed: wp.uint32,
 ) -> wp.vec3:
@@ -112,7 +122,7 @@ def lobe_light(
     hit = bvh_intersect(scene.bvh, ray_origin(s), wi, float(wp.inf))
     if hit.face < 0:
         return wp.vec3(0.0, 0.0, 0.0)
-    return wp.cw_mul(b.weight, leaving_radiance(scene, samplers, paths, hit, wi, index, seed))
+    return wp.cw_mul(b.weight, leaving_radiance(scene, samplers, paths, hit, wi, soft, index, seed))
 
 
 # Light of a sharp surface's diffuse lobe, which needs no ray but to suns.
@@ -153,7 +163,7 @@ def traced_light(
         r.environment = path.environment
         r.indirect = path.indirect
     if query.sharp != 0 and (query.terms & WANTS_INDIRECT) != 0:
-        r.indirect = lobe_light(scene, samplers, paths, s, wp.transpose(s.shading) * view, index, seed)
+        r.indirect = lobe_light(scene, samplers, paths, s, wp.transpose(s.shading) * view, query.soft, index, seed)
     return r
 
 

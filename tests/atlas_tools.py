@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from transfer_tools import transfer_settings
 
 import warp_gi as gi
 from warp_gi.scene.scene import Scene
@@ -12,11 +13,8 @@ from warp_gi.techniques.radiance_transfer.textures import Atlas
 
 def settings(**changes) -> TransferSettings:
     """Return settings of a small atlas."""
-    values = {
-        "storage": "texture", "resolution": 128, "texel_sets": "one", "charts": "xatlas", "chart_seconds": 0.0,
-        "order": 5, "first_rays": 64, "rays": 512, "bounce_rays": 64, "bounces": 4, "tolerance": 0.002,
-    }  # fmt: skip
-    return TransferSettings(**{**values, **changes})
+    base = {"resolution": 128, "texel_sets": "one", "charts": "xatlas", "bounces": 4}
+    return transfer_settings(**{**base, **changes})
 
 
 def fetched(atlas: Atlas, faces: np.ndarray, u: np.ndarray, v: np.ndarray, side: int = 0):

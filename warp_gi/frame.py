@@ -91,6 +91,8 @@ class Frame:
         """Values by name that decide the pixels, beside camera and time."""
         self.paths = PathRequest(data.emitters)
         """Requests of estimators to the path tracer."""
+        self.estimators: dict[str, object] = {}
+        """Estimators of the pipeline by their terms; a class that serves several finds its others here."""
         self.sky_probability = sky_probability(scene)
         """Probability of sampling the sky where a path vertex samples either the sky or an emitter."""
         self._offers: dict[type, Any] = {}

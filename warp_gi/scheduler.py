@@ -231,6 +231,7 @@ class FrameScheduler:
         cameras = self._camera_at(index), self._camera_at(previous_index)
         settings, seed = self.pipeline.frame_settings, _mix(self.seed, index)
         frame = Frame(self.scene, data, *cameras, settings, self.device, index, now, seed, previous_index)
+        frame.estimators = dict(self.pipeline.estimators())
         compiled = launch.compile_seconds - compiled
         frame.timings |= {"bake": self._bake_seconds, "compile": compiled}
         frame.timings["scene"] = time.perf_counter() - started - compiled

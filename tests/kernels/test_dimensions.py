@@ -97,8 +97,9 @@ def test_probes_draw_beside_their_paths():
 def test_transfer_draws_beside_its_paths():
     """The path of a sharp lobe's light from the sky, and the one from what its ray meets, have the ray's index."""
     paths = path_numbers(BsdfPaths().max_depth - 1)
-    drawn = [(STRATIFIED, d.TRANSFER_LOBE_DIMENSION), (STRATIFIED, d.TRANSFER_SUN_DIMENSION)]
-    assert len(set(drawn)) == 2 and not paths.keys() & set(drawn)
+    of_pixel = (d.TRANSFER_LOBE_DIMENSION, d.TRANSFER_SUN_DIMENSION, d.TRANSFER_HIT_SUN_DIMENSION)
+    drawn = [(STRATIFIED, dimension) for dimension in of_pixel]
+    assert len(set(drawn)) == 3 and not paths.keys() & set(drawn)
 
 
 def test_paths_that_measure_reach_do_not_meet():

@@ -76,7 +76,7 @@ def test_what_a_bake_holds(scene, bake, tmp_path):
     }  # fmt: skip
     assert 64 * slots < bake.counts["rays"] < 512 * slots
     assert 1 <= bake.counts["bounces"] < 16 and bake.counts["last_share"] < 0.002
-    assert bake.counts["black_share"] < 0.3
+    assert bake.counts["black_share"] < 0.01
     assert {f"{stage}_{kind}" for stage in ("charts", "rays", "bounces") for kind in ("seconds", "cpu_seconds")} < set(
         bake.counts
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from warp_gi.kernels.transfer_snippets import clamped_cosine
 from warp_gi.scene.harmonics import basis, by_coefficient
 from warp_gi.techniques.radiance_transfer import products
 
@@ -79,7 +80,7 @@ def test_light_matrix_multiplies_functions():
 
 
 def test_transfer_without_occluders_is_the_clamped_cosine():
-    factors = products.clamped_cosine(9)
+    factors = clamped_cosine(9)
     assert factors[:5] == pytest.approx([np.pi, 2 * np.pi / 3, np.pi / 4, 0, -np.pi / 24])
     directions, weights = grid(40, 80, low=0.0)
     expected = (weights * directions[:, 2]) @ basis(directions, 9)

@@ -122,7 +122,7 @@ def test_threads_saving_and_one_launch_change_no_bit(tmp_path, monkeypatch):
 
 def test_one_bake_serves_both_terms_in_one_piece_of_memory():
     scheduler = gi.FrameScheduler(corner(1.0), view(), pipeline(), st.device().alias)
-    assert scheduler.state("environment") is scheduler.state("indirect")
+    assert scheduler.state("environment").rows is scheduler.state("indirect").rows
     assert pipeline().dependence(corner(1.0)).kind == "independent"
 
 
@@ -187,6 +187,53 @@ def test_sharp_lobes_are_traced(roughness):
         assert frame.numpy(term)[seen].mean() == pytest.approx(truth.numpy(term)[seen].mean(), rel=bound), term
 
 
+@pytest.mark.filterwarnings("ignore:environment. 1 small lamps")
+def test_mirrored_suns_are_as_soft():
+    """A mirror shows the penumbra of a wide sun, as paths do; with points for suns it shows a hard shadow."""
+    pixels = np.full((32, 64, 3), 0.1, np.float32)
+    pixels[5:8, 9:12] = 200.0
+    mirror = gi.Material("mirror", (0.9, 0.9, 0.9), metallic=1.0, roughness=0.02)
+    meshes = [
+        quad((-2, 0, 2), (4, 0, 0), (0, 0, -4), GREY, "floor"),
+        quad((-0.5, 1, 0.5), (1, 0, 0), (0, 0, -1), GREY, "card"),
+        quad((-2, 0, -2), (4, 0, 0), (0, 2, 0), mirror, "mirror"),
+    ]
+    scene = gi.Scene([gi.Node(mesh.name, [mesh]) for mesh in meshes], environment=gi.Environment(pixels=pixels))
+    bake = gi.bake(scene, DIRECT, st.device().alias)
+    truth = rendered(scene, gi.Pipeline(spp=1024, emitters=None)).numpy("indirect")
+    pictures = []
+    for soft in (True, False):
+        direct, indirect = (replace(one, soft_suns=soft) for one in (DIRECT, INDIRECT))
+        frame = rendered(scene, pipeline(environment=direct, indirect=indirect, spp=64), bakes=[bake])
+        pictures.append(frame.numpy("indirect"))
+    mirrored = (frame.numpy("object_id") == 2)[..., None]
+    penumbra = mirrored & (abs(pictures[0] - pictures[1]) > 0.15)
+    errors = [abs(picture - truth)[penumbra].mean() for picture in pictures]
+    assert penumbra.sum() > 40 and errors[0] < 0.5 * errors[1], (penumbra.sum(), errors)
+
+
+@pytest.mark.parametrize("lost", ["pages", "texels"])
+def test_surfaces_without_slots_are_traced(lost):
+    """Matt and at rest, with nothing else in the scene that needs a ray."""
+    scene = corner(sky_of(slope))
+    bake = gi.bake(scene, DIRECT, st.device().alias)
+    assert not DIRECT.start(scene, st.device().alias, bake).needs_rays
+    wall = np.flatnonzero(scene._flat.materials == [one.name for one in scene.materials].index("red"))
+    arrays = {name: array.copy() for name, array in bake.arrays.items()}
+    if lost == "pages":
+        arrays["atlas_face_pages"][wall] = -1
+    else:
+        slots = arrays["atlas_slots"]
+        slots[(slots >= 0) & np.isin(arrays["atlas_slot_faces"][slots], wall)] = -1
+    without = gi.Bake(bake.technique, bake.scene_key, bake.settings, arrays, bake.counts, bake.scene_name)
+    frame, truth = rendered(scene, pipeline(spp=64), bakes=[without]), rendered(scene, gi.Pipeline(spp=512))
+    seen = truth.numpy("material_id") == frame.numpy("material_id")
+    seen &= truth.numpy("albedo")[..., 0] > 5 * truth.numpy("albedo")[..., 1]
+    assert seen.sum() > 100
+    for term in ("environment", "indirect"):
+        assert frame.numpy(term)[seen].mean() == pytest.approx(truth.numpy(term)[seen].mean(), rel=0.03), term
+
+
 @pytest.mark.parametrize(("roughness", "bound"), [(0.8, 0.06), (0.6, 0.12)])
 def test_glossy_lobes_by_transfer(roughness, bound):
     """Under a sky of few numbers, direct light of a rough metal is near the truth."""
@@ -225,6 +272,10 @@ def test_lamps_that_move_are_refused_with_what_to_take_instead():
     scene.animate("lamp", [gi.Keyframe(0.0, (0, 0.9, 0)), gi.Keyframe(1.0, (0, 0.9, 0.4))])
     with pytest.raises(gi.OptionError, match=r"lamps of this scene move.*BsdfPaths\(ends_in=RadianceTransfer"):
         rendered(scene, pipeline(environment=None))
+    with pytest.warns(UserWarning, match="knows nothing of what moves"):
+        bake = gi.bake(scene, DIRECT, st.device().alias)  # which direct light may take
+    with pytest.raises(gi.OptionError, match="lamps of this scene move"):
+        rendered(scene, pipeline(environment=None), bakes=[bake])
 
 
 def test_a_sky_of_lamps_warns():

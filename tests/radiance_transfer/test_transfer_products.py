@@ -11,8 +11,8 @@ from scipy.special import lpmv
 from statistics_tools import device, every_device  # noqa: F401
 
 from warp_gi import launch
-from warp_gi.kernels import transfer_products
 from warp_gi.kernels.transfer_products import WIDTHS, bounced_product, environment_product, glossy_product, vec6
+from warp_gi.kernels.transfer_snippets import clamped_cosine
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,9 +36,8 @@ def basis(directions, order):
 @wp.kernel
 def products(
     first: wp.int32,
-    rows: wp.array(dtype=wp.float16),
-    bounces: wp.array(dtype=wp.float16),
-    width: wp.int32,
+    rows: wp.array2d(dtype=wp.float16),
+    bounces: wp.array2d(dtype=wp.float16),
     light: wp.array(dtype=wp.float32),
     matrix: wp.array(dtype=wp.float32),
     points: wp.array(dtype=wp.float32),
@@ -57,8 +56,8 @@ def products(
     direction = wp.vec3(points[at + 14], points[at + 15], points[at + 16])
     normal = wp.vec3(points[at + 17], points[at + 18], points[at + 19])
     normal_lobe = wp.vec4(points[at + 20], points[at + 21], points[at + 22], points[at + 23])
-    a = environment_product(rows, width, slots, shares, light)
-    b = glossy_product(rows, width, slots, shares, matrix, direction, lobe, normal, normal_lobe)
+    a = environment_product(rows, slots, shares, light)
+    b = glossy_product(rows, slots, shares, matrix, direction, lobe, normal, normal_lobe)
     d = bounced_product(bounces, slots, shares, light)
     for c in range(3):
         out[i, c] = a[c]
@@ -93,9 +92,8 @@ def test_products_are_those_of_numpy(order):
     at = device()
     out = wp.zeros((POINTS, 12), dtype=wp.float32, device=at)
     arrays = [
-        wp.array(transfer.ravel(), dtype=wp.float16, device=at),
-        wp.array(bounces.ravel(), dtype=wp.float16, device=at),
-        width,
+        wp.array(transfer, dtype=wp.float16, device=at),
+        wp.array(bounces.reshape(SLOTS, 96), dtype=wp.float16, device=at),
         wp.array(light.ravel(), dtype=wp.float32, device=at),
         wp.array(matrix.ravel(), dtype=wp.float32, device=at),
         wp.array(points.ravel(), dtype=wp.float32, device=at),
@@ -112,8 +110,38 @@ def test_products_are_those_of_numpy(order):
     about_n = np.pad(normal_lobe, ((0, 0), (1, 1)))
     product = np.einsum("pk,kci->pci", lobe[:, bands] * y + about_n[:, bands] * y_normal, matrix.astype(np.float64))
     shaded = np.einsum("pci,pi->pc", product[..., :count], blend[:, :count])
-    unshaded = y_normal * np.array(transfer_products.clamped_cosine(order))[bands]
+    unshaded = y_normal * np.array(clamped_cosine(order))[bands]
     np.testing.assert_allclose(out.numpy()[:, 3:6], shaded, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(
         out.numpy()[:, 6:9], np.einsum("pci,pi->pc", product[..., :count], unshaded), rtol=1e-4, atol=1e-4
     )
+
+
+def test_rows_past_two_thousand_million_numbers():
+    """The same memory as the end of arrays that begin far before it, which nobody reads: indices need 64 bits."""
+    rng, at, far = np.random.default_rng(1), device(), 1 << 26
+    points = np.zeros((POINTS, 24), np.float32)
+    points[:, :4] = 8 * rng.integers(0, SLOTS, (POINTS, 4))  # whole numbers of float32 behind `far`, too
+    points[:, 4:] = rng.normal(size=(POINTS, 20))
+    rows, bounces = (
+        wp.array(rng.normal(size=(8 * SLOTS, width)), dtype=wp.float16, device=at) for width in (WIDTHS[5], 96)
+    )
+    light = wp.array(rng.normal(size=96), dtype=wp.float32, device=at)
+    matrix = wp.array(rng.normal(size=25 * 96), dtype=wp.float32, device=at)
+    found = []
+    for start in (0, far):
+        points[:, :4] += start
+        arrays = [
+            wp.array(
+                ptr=one.ptr - start * one.strides[0],
+                shape=(start + one.shape[0], one.shape[1]),
+                dtype=wp.float16,
+                device=at,
+            )
+            for one in (rows, bounces)
+        ]
+        out = wp.zeros((POINTS, 12), dtype=wp.float32, device=at)
+        inputs = [*arrays, light, matrix, wp.array(points.ravel(), dtype=wp.float32, device=at), out]
+        launch.launch(products, POINTS, inputs, at)
+        found.append(out.numpy())
+    assert abs(found[0]).min(axis=0).max() > 0 and (found[0] == found[1]).all()

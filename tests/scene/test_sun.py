@@ -104,6 +104,21 @@ def test_cones_hold_their_suns():
     assert 1 - split.cos_discs[0] ** 2 == pytest.approx(2 * spread, rel=0.03)
 
 
+@pytest.mark.parametrize("row", [4, 9, 15])
+def test_a_texel_is_a_disc_of_its_own_width(row):
+    """Its light falls to 0 at the next nodes; towards a pole these are nearer to each other along a row."""
+    pixels = np.full((32, 64, 3), 1e-3, np.float32)
+    pixels[row, 20] = 1000.0
+    split = Environment(pixels=pixels).split_sun()
+    steps = np.linspace(-1, 1, 201)
+    down, right = np.meshgrid(steps, steps, indexing="ij")
+    theta, phi = (row + down) * np.pi / 31, (20.5 + right) * np.pi / 32
+    towards = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=-1)
+    weights = (1 - abs(down)) * (1 - abs(right)) * np.sin(theta)
+    spread = (weights * (1 - (towards @ split.directions[0]) ** 2)).sum() / weights.sum()
+    assert 1 - split.cos_discs[0] ** 2 == pytest.approx(2 * spread, rel=0.03)
+
+
 def test_blobs_of_any_shape_are_whole():
     """A spiral of one texel's width, and a ring around a texel that is not bright."""
     pixels = np.full((64, 128, 3), 1e-3, np.float32)

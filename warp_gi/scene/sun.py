@@ -61,7 +61,9 @@ def split_map(pixels: np.ndarray, brighter_than: float, most: int) -> MapSplit:
     rest = pixels.copy()
     theta, phi = rows * (math.pi / (height - 1)), (columns + 0.5) * (2 * math.pi / width)
     towards = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=-1)
-    step = math.hypot(math.pi / (height - 1), 2 * math.pi / width)  # a texel's light reaches to the next, every way
+    down, right = math.pi / (height - 1), 2 * math.pi / width
+    step = math.hypot(down, right)  # a texel's light reaches to the next, every way; near a pole less far
+    spreads = (down**2 + (right * np.sin(theta)) ** 2) / 6  # of a texel's own light
     directions, irradiances, cones, discs = [], [], [], []
     for k in suns:
         held = blobs == k
@@ -71,8 +73,8 @@ def split_map(pixels: np.ndarray, brighter_than: float, most: int) -> MapSplit:
         axis /= np.linalg.norm(axis)
         cosines = np.clip(towards[held] @ axis, -1, 1)
         cone = min(math.acos(cosines.min()) + step, math.pi)
-        # the mean of sin^2 over an even disc is half that at its rim; a texel's own light has step^2 / 6
-        spread = 2 * (weights @ (1 - cosines**2) / weights.sum() + step**2 / 6)
+        # the mean of sin^2 over an even disc is half that at its rim
+        spread = 2 * (weights @ (1 - cosines**2 + spreads[held]) / weights.sum())
         directions.append(axis)
         irradiances.append(light[held].sum(axis=0))
         cones.append(math.cos(cone))

@@ -10,7 +10,8 @@ from warp_gi.kernels.gbuffer import PrimaryHits, tiled_pixel
 from warp_gi.kernels.surface import shading_normal, surface_at
 from warp_gi.kernels.transfer_atlas import TransferAtlas
 from warp_gi.kernels.transfer_light import TransferRows, is_kept, surface_slots
-from warp_gi.kernels.transfer_products import glossy_product, harmonics_code, vec6
+from warp_gi.kernels.transfer_products import glossy_product, vec6
+from warp_gi.kernels.transfer_snippets import HARMONICS, HAS_VECTOR_HALVES
 from warp_gi.kernels.types import SceneData
 
 wp.set_module_options({"enable_backward": False})
@@ -20,48 +21,45 @@ REORDERED = wp.constant(1)
 TPFL = wp.constant(2)
 
 # Sums over entries value, i | j << 8 | k << 16 of the table C_ijk, with T blended from rows of 32 halves.
-_SPARSE = """
-    wp::vec_t<3, float> result;
-    float y[32] = {}, f[32] = {}, t[32] = {};
-    const float x = direction[0], y_ = direction[1], z = direction[2];
+_SPARSE = (
     HARMONICS
-    for (int l = 0, k = 0; l < 5; ++l) for (int m = 0; m < 2 * l + 1; ++m, ++k) f[k] = lobe[l] * y[k];
-    for (int k = 0; k < 4; ++k) {
+    + f"""
+    wp::vec_t<3, float> result;
+    float f[32] = {{}}, t[32] = {{}}, g[32] = {{}};
+    harmonics(direction[0], direction[1], direction[2], 5, [&](int k, float value) {{ f[k] = value; }});
+    for (int l = 0, k = 0; l < 5; ++l) for (int m = 0; m < 2 * l + 1; ++m, ++k) f[k] *= lobe[l];
+    for (int k = 0; k < 4; ++k) {{
         if (shares[k] == 0.0f) continue;
         const wp::half* row = transfer.data + (size_t)slots[k] * 32;
-#if !defined(__CUDA_ARCH__) && (defined(__F16C__) || defined(__aarch64__))
+#if {HAS_VECTOR_HALVES}
         _Float16 numbers[32];
         __builtin_memcpy(numbers, row, 64);
 #else
         const wp::half* numbers = row;
 #endif
         for (int i = 0; i < 25; ++i) t[i] += static_cast<float>(numbers[i]) * shares[k];
-    }
-    const int count = terms.shape[0];
-    if (reordered) {
-        float g[32] = {};
-        for (int n = 0; n < count; ++n) {
+    }}
+    auto each = [&](auto add) {{
+        for (int n = 0; n < terms.shape[0]; ++n) {{
             const int e = terms.data[n];
-            g[e & 255] += values.data[n] * t[(e >> 8) & 255] * f[e >> 16];
-        }
-        for (int c = 0; c < 3; ++c) for (int i = 0; i < 25; ++i) result[c] += light.data[c * 32 + i] * g[i];
-    } else {
-        for (int c = 0; c < 3; ++c) {
-            float p[32] = {};
-            for (int n = 0; n < count; ++n) {
-                const int e = terms.data[n];
-                p[e >> 16] += values.data[n] * light.data[c * 32 + (e & 255)] * t[(e >> 8) & 255];
-            }
-            for (int k = 0; k < 25; ++k) result[c] += p[k] * f[k];
-        }
-    }
+            add(e & 255, (e >> 8) & 255, e >> 16, values.data[n]);
+        }}
+    }};
+    if (reordered) each([&](int i, int j, int k, float value) {{ g[i] += value * t[j] * f[k]; }});
+    for (int c = 0; c < 3; ++c) {{
+        const float* sky = light.data + c * 32;
+        float p[32] = {{}};
+        if (!reordered) each([&](int i, int j, int k, float value) {{ p[k] += value * sky[i] * t[j]; }});
+        for (int i = 0; i < 25; ++i) result[c] += reordered ? sky[i] * g[i] : p[i] * f[i];
+    }}
     return result;
 """
+)
 
 
-@wp.func_native(snippet=_SPARSE.replace("HARMONICS", harmonics_code(5)))
+@wp.func_native(snippet=_SPARSE)
 def sparse_product(
-    transfer: wp.array(dtype=wp.float16),
+    transfer: wp.array2d(dtype=wp.float16),
     slots: wp.vec4i,
     shares: wp.vec4,
     light: wp.array(dtype=wp.float32),
@@ -94,7 +92,7 @@ class ProductVertices:
 
 @wp.func
 def product(
-    transfer: wp.array(dtype=wp.float16),
+    transfer: wp.array2d(dtype=wp.float16),
     slots: wp.vec4i,
     shares: wp.vec4,
     query: ProductQuery,
@@ -104,7 +102,7 @@ def product(
     direction = 2.0 * wp.dot(normal, view) * normal - view
     if query.form == TPFL:
         none = wp.vec4(0.0, 0.0, 0.0, 0.0)
-        p = glossy_product(transfer, 32, slots, shares, query.matrix, direction, query.lobe, normal, none)
+        p = glossy_product(transfer, slots, shares, query.matrix, direction, query.lobe, normal, none)
         return wp.vec3(p[0], p[1], p[2])
     q = query
     return sparse_product(transfer, slots, shares, q.light, direction, q.lobe, q.terms, q.values, q.form)
@@ -140,7 +138,7 @@ def evaluate_pixels(
 @wp.kernel(enable_backward=False)
 def evaluate_vertices(
     first: wp.int32,
-    transfer: wp.array(dtype=wp.float16),
+    transfer: wp.array2d(dtype=wp.float16),
     query: ProductQuery,
     vertices: ProductVertices,
     colors: wp.array(dtype=wp.vec3),

@@ -5,22 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import reduce
 from numbers import Real
+from operator import or_
 from typing import TYPE_CHECKING, Literal
 
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.kernels import path_trace, transfer_light, transfer_shade
-from warp_gi.kernels.transfer_products import ORDERS
+from warp_gi.kernels.transfer_snippets import ORDERS
 from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import whole_scene
-from warp_gi.stateful import Ahead, Service
+from warp_gi.stateful import Service
 from warp_gi.techniques.radiance_transfer.bake import bake_transfer, transfer_key
 from warp_gi.techniques.radiance_transfer.bounces import lamps_move
 from warp_gi.techniques.radiance_transfer.densities import parse_texel_sets
 from warp_gi.techniques.radiance_transfer.settings import TransferSettings
 from warp_gi.techniques.radiance_transfer.sky import SkyLight, TransferLight
-from warp_gi.techniques.radiance_transfer.state import TransferState, transfer_state
+from warp_gi.techniques.radiance_transfer.state import TransferState, needs_rays, transfer_state
 
 if TYPE_CHECKING:
     from warp_gi.baking import Bake, Setting
@@ -85,7 +87,8 @@ class RadianceTransfer(Estimator, RadianceCache):
     glossy: Literal["auto", "ratio", "transfer", "traced"] = "auto"
     """How glossy lobes are lit: "transfer" by transfer alone, as in the paper; "ratio" by the sky prefiltered for the
     lobe, of which transfer says how much occluders let through; "traced" by rays; "auto" by transfer down to a
-    roughness of ``ratio_below``, by the ratio down to ``traced_below``, and by rays below."""
+    roughness of ``ratio_below``, by the ratio down to ``traced_below``, and by rays below. "transfer" and "ratio" take
+    lobes of a roughness below 0.2 for ones of 0.2."""
     lobe: Literal["ggx", "phong"] = "ggx"
     """Lobe of "transfer" and "ratio": that of the materials ("ggx"), or the paper's ("phong") about the mirrored view,
     (s + 2) / (2 pi) cos^s with s = 2 / roughness^4 - 2, which loses light towards grazing views."""
@@ -139,6 +142,10 @@ class RadianceTransfer(Estimator, RadianceCache):
         return TransferSettings(**{name: getattr(self, name) for name in TransferSettings.__dataclass_fields__})
 
     @property
+    def _traced_below(self) -> float:
+        return {"ratio": 0.0, "transfer": 0.0, "traced": 2.0}.get(self.glossy, self.traced_below)
+
+    @property
     def services(self) -> tuple[Service, ...]:
         """The present sky, which both terms share."""
         return (TransferLight(self.transfer_settings, self.sun, self.window, self.lobe),)
@@ -166,12 +173,18 @@ class RadianceTransfer(Estimator, RadianceCache):
         return bake_transfer(scene, self.transfer_settings, device, seed, progress)
 
     def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> TransferState:
-        """Return the bake on the device; terms that share it share its memory."""
-        return transfer_state(bake or self.bake(whole_scene(scene), device, seed), device)
+        """Return the bake on the device; terms that share it share its memory.
 
-    def _check_lamps(self, scene: Scene | BakedScene) -> None:
+        Raises OptionError for indirect light of lamps that move.
+        """
+        scene = whole_scene(scene)
+        self._check_lamps(scene)
+        state = transfer_state(bake or self.bake(scene, device, seed), device)
+        return replace(state, needs_rays=needs_rays(scene, state.bare_faces, self._traced_below))
+
+    def _check_lamps(self, scene: Scene) -> None:
         """Raise OptionError for indirect light of lamps that move."""
-        if self.term == "indirect" and self.bounces > 0 and lamps_move(whole_scene(scene)):
+        if self.term == "indirect" and lamps_move(scene):
             raise OptionError(
                 "lamps of this scene move, and what is baked holds the bounces of lamps that rest; take "
                 "indirect=BsdfPaths(ends_in=RadianceTransfer()), which traces the first bounce of their light"
@@ -179,45 +192,27 @@ class RadianceTransfer(Estimator, RadianceCache):
 
     # ---- frames ----
 
-    def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
-        """Return False: the bake is all that is kept, and the sky is the frame's own."""
-        return False
-
-    def preprocess(self, frame: Frame, state: TransferState) -> TransferState:
-        """Let the terms of equal settings know of each other, so that one launch serves them.
-
-        Raises OptionError for indirect light of lamps that move.
-        """
-        self._check_lamps(frame.scene)
-        others = frame.offered(_Together)
-        frame.offer(_Together((*(others.estimators if others else ()), self)))
-        return state
-
     def give(self, frame: Frame, state: TransferState) -> None:
         """Let paths end in what is known of light that was reflected before."""
-        frame.offer(_Lent(self))
         frame.paths.use_cache(transfer_light.TRANSFER_CACHE, transfer_cache(state, self._sky(frame)))
 
     def trace(self, frame: Frame, state: TransferState) -> None:
         """Add the light of the current camera sample, of all terms with these settings at once."""
-        together, lent = frame.offered(_Together), frame.offered(_Lent)
-        terms = list(together.estimators) if together else [self]
-        if lent is not None:
-            terms.remove(lent.cache)
-        alike = [one for one in terms if replace(one, term=self.term) == self]
-        if alike[0].term != self.term:
+        own = {term: one for term, one in frame.estimators.items() if isinstance(one, RadianceTransfer)}
+        mine = [term for term, one in own.items() if replace(one, term=self.term) == self]
+        if mine[0] != self.term:
             return  # the first of them did it
         query, buffers = transfer_shade.TransferQuery(), transfer_shade.TransferBuffers()
         buffers.width, buffers.height = frame.camera.resolution
-        query.terms = sum(TERM_BITS[one.term] for one in alike)
-        for one in alike:
-            setattr(buffers, one.term, frame[one.term])
-            for order, moment in enumerate(frame.moments(one.term), 1):
-                setattr(buffers, f"{one.term}_moment{order}", moment)
-        query.traced_below = {"ratio": 0.0, "transfer": 0.0, "traced": 2.0}.get(self.glossy, self.traced_below)
+        query.terms = reduce(or_, (TERM_BITS[term] for term in mine))
+        for term in mine:
+            setattr(buffers, term, frame[term])
+            for order, moment in enumerate(frame.moments(term), 1):
+                setattr(buffers, f"{term}_moment{order}", moment)
+        query.traced_below = self._traced_below
         query.ratio_below = {"ratio": 2.0, "transfer": 0.0}.get(self.glossy, self.ratio_below)
         query.soft = int(self.soft_suns)
-        query.traces = int(_needs_rays(frame.scene, query.traced_below))
+        query.traces = int(state.needs_rays)
         sky = self._sky(frame)
         inputs = [frame.data, frame.pass_settings, state.rows, sky, query, frame.hits, buffers]
         frame.launch_tiled(transfer_shade.shade_transfer, inputs)
@@ -256,28 +251,3 @@ def transfer_cache(state: TransferState, sky: transfer_light.TransferSky) -> tra
     cache = transfer_light.TransferCache()
     cache.rows, cache.sky = state.rows, sky
     return cache
-
-
-def _needs_rays(scene: Scene | BakedScene, traced_below: float) -> bool:
-    """Return whether something moves, or a surface may be sharper than ``traced_below``."""
-    if scene.is_animated or traced_below <= 0:
-        return scene.is_animated
-    return any(
-        (one.specular > 0 or one.metallic > 0)
-        and (one.roughness < traced_below or one.metallic_roughness_texture is not None)
-        for one in whole_scene(scene).materials
-    )
-
-
-@dataclass(frozen=True)
-class _Lent:
-    """The cache in which paths end: it preprocesses as terms do, but is none."""
-
-    cache: RadianceTransfer
-
-
-@dataclass(frozen=True)
-class _Together:
-    """Estimators of this class in a frame."""
-
-    estimators: tuple[RadianceTransfer, ...]

@@ -13,9 +13,9 @@ from functools import cache
 import numpy as np
 
 from warp_gi.errors import OptionError
+from warp_gi.kernels.transfer_snippets import LIGHT_ORDER, clamped_cosine
 from warp_gi.scene import harmonics
 from warp_gi.techniques.radiance_transfer import products
-from warp_gi.techniques.radiance_transfer.settings import LIGHT_ORDER
 
 ROUGHNESSES = 16
 """Rows of a LobeTable, from SMALLEST_ROUGHNESS to 1 in equal steps."""
@@ -79,7 +79,7 @@ class LobeTable:
         1/4 about_d[0] + 1/2 (about_d[1] c + about_n[1]) + 5/16 (about_d[2] P_2(c) + about_n[2])
         - 3/32 (about_d[4] P_4(c) + about_n[4]).
         """
-        factors = products.clamped_cosine(self.order) * (2 * np.arange(self.order) + 1) / (4 * math.pi)
+        factors = np.array(clamped_cosine(self.order)) * (2 * np.arange(self.order) + 1) / (4 * math.pi)
         legendre = np.polynomial.legendre.legvander(entries[..., 1:2], self.order - 1)[..., 0, :]
         about_d, about_n = entries[..., 4 : 4 + self.order], entries[..., 4 + self.order :]
         return (about_d * legendre) @ factors + about_n @ factors[1 : 1 + NORMAL_BANDS]

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from warp_gi.errors import OptionError, check_whole
+from warp_gi.kernels.transfer_snippets import LIGHT_ORDER
 from warp_gi.scene import harmonics
-from warp_gi.techniques.radiance_transfer.settings import LIGHT_ORDER
 from warp_gi.techniques.radiance_transfer.textures import LIGHT_NUMBERS
 
 CHANNELS = 3 * LIGHT_NUMBERS

@@ -12,8 +12,8 @@ from functools import cache
 
 import numpy as np
 
+from warp_gi.kernels.transfer_snippets import LIGHT_ORDER, clamped_cosine
 from warp_gi.scene import harmonics
-from warp_gi.techniques.radiance_transfer.settings import LIGHT_ORDER
 
 _ROUNDING = 1e-12
 """Tripling coefficients below it are 0; the smallest of others is 6e-3."""
@@ -43,24 +43,9 @@ def light_matrix(light: np.ndarray, order: int) -> np.ndarray:
     return (light @ table.reshape(len(table), -1)).reshape(-1, order**2, order**2)
 
 
-def clamped_cosine(order: int) -> np.ndarray:
-    """Return factors A_l, float64 [order], of max(0, n . w): pi, 2 pi/3, pi/4, 0, -pi/24, ...
-
-    Source: Ramamoorthi and Hanrahan, "An Efficient Representation for Irradiance Environment Maps", Eq. 8.
-    """
-    result = np.zeros(order)
-    for l in range(order):
-        if l == 1:
-            result[l] = 2 * math.pi / 3
-        elif l % 2 == 0:
-            sign = -1.0 if l % 4 == 0 else 1.0
-            result[l] = 2 * math.pi * sign / ((l + 2) * (l - 1)) * math.comb(l, l // 2) / 2**l
-    return result
-
-
 def unoccluded(normals: np.ndarray, order: int) -> np.ndarray:
     """Return transfer T_j = A_l y_j(n) of points from which all of the sky is seen, float64 [..., order^2]."""
-    return harmonics.by_coefficient(clamped_cosine(order)) * harmonics.basis(normals, order)
+    return harmonics.by_coefficient(np.array(clamped_cosine(order))) * harmonics.basis(normals, order)
 
 
 def zonal(directions: np.ndarray, factors: np.ndarray) -> np.ndarray:

@@ -56,7 +56,8 @@ class TracedTransfer:
     transfer: np.ndarray
     """T_j = int V max(n.w, 0) y_j dw [sr], float16 [slots, order^2]."""
     hits: np.ndarray
-    """Slot that each of the first rays of a slot hits, int32 [slots, bounce_rays]; -1 for the sky, -2 for black."""
+    """Slot that each of the first rays of a slot hits, int32 [slots, bounce_rays]; -1 for the sky, -2 for what
+    has no slot, -3 for rays that start below the surface."""
     rays: np.ndarray
     """Rays traced for each slot, int32 [slots]."""
 

@@ -7,9 +7,6 @@ from typing import Literal
 
 from warp_gi.baking import Setting
 
-LIGHT_ORDER = 5
-"""Order of the spherical harmonics of the sky: 25 numbers a channel."""
-
 
 @dataclass(frozen=True)
 class TransferSettings:

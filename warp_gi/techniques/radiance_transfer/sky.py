@@ -13,6 +13,7 @@ import warp as wp
 from warp_gi.kernels import transfer_lobes
 from warp_gi.kernels.transfer_light import TransferSky
 from warp_gi.kernels.transfer_products import LIGHT_WIDTH, WIDTHS
+from warp_gi.kernels.transfer_snippets import LIGHT_ORDER
 from warp_gi.launch import get_device, on_device
 from warp_gi.scene import harmonics
 from warp_gi.scene.environment import Environment
@@ -20,7 +21,7 @@ from warp_gi.stateful import Ahead, Service
 from warp_gi.techniques.radiance_transfer import products
 from warp_gi.techniques.radiance_transfer.lobes import SMALLEST_ROUGHNESS, lobe_table, phong_table
 from warp_gi.techniques.radiance_transfer.prefiltered import prefiltered, sky_lookups
-from warp_gi.techniques.radiance_transfer.settings import LIGHT_ORDER, TransferSettings
+from warp_gi.techniques.radiance_transfer.settings import TransferSettings
 
 if TYPE_CHECKING:
     from warp_gi.baking import Bake

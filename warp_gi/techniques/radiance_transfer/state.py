@@ -12,6 +12,8 @@ from warp_gi.baking import Bake
 from warp_gi.kernels.transfer_light import TransferRows
 from warp_gi.kernels.transfer_products import LIGHT_WIDTH, WIDTHS
 from warp_gi.launch import get_device, on_device
+from warp_gi.scene.scene import Scene
+from warp_gi.techniques.radiance_transfer.atlas import can_be_charted
 from warp_gi.techniques.radiance_transfer.textures import transfer_textures
 
 LINE = 64
@@ -24,8 +26,10 @@ class TransferState:
 
     rows: TransferRows
     """Atlas and rows."""
-    order: int
-    """Order of the harmonics of transfer."""
+    bare_faces: np.ndarray
+    """Faces whose fronts find no slot, int32 [n]: those that move among them."""
+    needs_rays: bool = True
+    """Whether a scene has surfaces whose light takes rays: what moves, what has no slots, or sharp lobes."""
 
 
 _states: weakref.WeakKeyDictionary[Bake, dict[str, TransferState]] = weakref.WeakKeyDictionary()
@@ -39,15 +43,30 @@ def transfer_state(bake: Bake, device: str) -> TransferState:
     return known[device]
 
 
+def needs_rays(scene: Scene, bare_faces: np.ndarray, traced_below: float) -> bool:
+    """Return whether something moves, lacks slots, or may be sharper than ``traced_below``.
+
+    Faces without an area, as an atlas counts it, are never seen.
+    """
+    if scene.is_animated:
+        return True
+    for one in scene.materials:
+        is_sharp = one.roughness < traced_below or one.metallic_roughness_texture is not None
+        if traced_below > 0 and is_sharp and (one.specular > 0 or one.metallic > 0):
+            return True
+    flat = scene._flat
+    return bool(can_be_charted(flat.points[flat.indices[bare_faces]].astype(np.float64)).any())
+
+
 def _made(bake: Bake, device: wp.Device) -> TransferState:
     textures = transfer_textures(bake)
     order = round(textures.transfer.shape[1] ** 0.5)
     rows = TransferRows()
-    rows.atlas, rows.width = textures.atlas.on(device), WIDTHS[order]
-    rows.transfer = on_device(_padded(textures.transfer, rows.width).reshape(-1), wp.float16, device)
-    rows.bounces = on_device(_padded(textures.bounces, LIGHT_WIDTH).reshape(-1), wp.float16, device)
+    rows.atlas = textures.atlas.on(device)
+    rows.transfer = on_device(_padded(textures.transfer, WIDTHS[order]), wp.float16, device)
+    rows.bounces = on_device(_padded(textures.bounces, LIGHT_WIDTH).reshape(-1, 3 * LIGHT_WIDTH), wp.float16, device)
     rows.lamps = on_device(textures.lamps, wp.vec3, device)
-    return TransferState(rows, order)
+    return TransferState(rows, np.flatnonzero(~textures.atlas.has_fronts()).astype(np.int32))
 
 
 def _padded(values: np.ndarray, width: int) -> np.ndarray:

@@ -10,11 +10,10 @@ import warp as wp
 from warp_gi.baking import Bake
 from warp_gi.errors import BakeError
 from warp_gi.kernels.transfer_atlas import TransferAtlas
+from warp_gi.kernels.transfer_snippets import LIGHT_NUMBERS
 from warp_gi.launch import on_device
 
 TECHNIQUE = "RadianceTransfer"
-LIGHT_NUMBERS = 25
-"""Coefficients of the sky a channel, and so of what bounces (order 5)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +46,22 @@ class Atlas:
     def count(self) -> int:
         """Number of slots."""
         return len(self.slot_faces)
+
+    def has_fronts(self) -> np.ndarray:
+        """Return whether a fetch in the middle of each face finds slots of its front, bool [faces]."""
+        if self.corner_slots.size:
+            return np.asarray((self.corner_slots[0] >= 0).any(axis=1))
+        result = self.face_pages >= 0
+        faces = np.flatnonzero(result)
+        first, *size = self.pages[self.face_pages[faces]].T
+        last = np.stack(size, axis=1) - 1
+        low = np.clip(self.corners[faces].mean(axis=1) - 0.5, 0, last).astype(np.int32)
+        high = np.minimum(low + 1, last)
+        slots = [
+            self.slots[0, first + y * size[0] + x] for y in (low[:, 1], high[:, 1]) for x in (low[:, 0], high[:, 0])
+        ]
+        result[faces] = np.max(slots, axis=0) >= 0
+        return result
 
     def on(self, device: wp.Device) -> TransferAtlas:
         """Return the atlas as kernels read it."""

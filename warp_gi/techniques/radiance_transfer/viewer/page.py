@@ -22,11 +22,11 @@ import numpy as np
 from warp_gi.baking import Bake
 from warp_gi.errors import BakeError, OptionError
 from warp_gi.files import replacing
+from warp_gi.kernels.transfer_snippets import LIGHT_ORDER
 from warp_gi.scene import harmonics
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.environment import Environment
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.radiance_transfer.settings import LIGHT_ORDER
 from warp_gi.techniques.radiance_transfer.textures import Atlas, TransferTextures, transfer_textures
 from warp_gi.techniques.radiance_transfer.viewer import pages, skies, surfaces
 from warp_gi.techniques.radiance_transfer.viewer.pages import Rows

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from warp_gi.color import LUMINANCE
+from warp_gi.kernels.transfer_snippets import LIGHT_ORDER
 from warp_gi.scene.environment import Environment
-from warp_gi.techniques.radiance_transfer.settings import LIGHT_ORDER
 
 LARGEST_HEIGHT = 512
 """Rows of the map behind the scene."""
