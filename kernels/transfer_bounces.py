@@ -134,26 +134,3 @@ def gather_glossy(
         result[slot, 0, k] = red[k]
         result[slot, 1, k] = green[k]
         result[slot, 2, k] = blue[k]
-
-
-# Thread: an item of a list of slots that light has not been seen to get to. Tells whether it does: whether at least
-# `needed` of a slot's rays hit slots that it gets to.
-@wp.kernel
-def spread_reach(
-    first: wp.int32,
-    dark: wp.array(dtype=wp.int32),
-    hits: wp.array2d(dtype=wp.int32),
-    reached: wp.array(dtype=wp.uint8),
-    needed: wp.int32,
-    result: wp.array(dtype=wp.uint8),
-):
-    item = first + wp.tid()
-    slot = dark[item]
-    count = int(0)
-    for i in range(hits.shape[1]):
-        hit = hits[slot, i]
-        if hit >= 0:
-            count += wp.int32(reached[hit])
-        if count >= needed:
-            break
-    result[item] = wp.uint8(wp.int32(count >= needed))

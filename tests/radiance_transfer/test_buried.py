@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 import statistics_tools as st
 from scene_tools import quad
+from transfer_tools import transfer_settings
 
 import warp_gi as gi
 from warp_gi.bench.harness.court import block, court, court_camera
-from warp_gi.techniques.radiance_transfer.buried import MARGIN, off_edges, reached_slots
+from warp_gi.launch import get_device
+from warp_gi.techniques.radiance_transfer.atlas import make_atlas
+from warp_gi.techniques.radiance_transfer.buried import MARGIN, back_shares, off_edges, without_buried
+from warp_gi.techniques.radiance_transfer.rays import trace_slots, transfer_work
 
 GREY = gi.Material("grey", (0.6, 0.6, 0.6), specular=0.0)
 
@@ -31,11 +35,46 @@ def test_faces_smaller_than_a_texel_keep_their_points_inside():
     assert min(u, v, 1 - u - v) > 0.15
 
 
-def test_light_gets_along_hits_but_not_by_a_few():
-    hits = np.array([[-1, 1, 1, 1], [0, 0, 2, 2], [1, 1, 1, 3], [4, 4, 4, 0], [3, 3, 3, 3], [-2, -2, -2, -2]])
-    assert reached_slots(hits).tolist() == [True, True, True, False, False, False]
-    lit = np.array([False, False, False, False, True, False])
-    assert reached_slots(hits, lit).tolist() == [True, True, True, True, True, False]
+def post_in_a_floor(below: float) -> gi.Scene:
+    """A post through a floor, under a white sky that is below the floor, too."""
+    walls = block((-0.25, -below, -0.25), (0.5, 1.0 + below, 0.5), 0.0, GREY)
+    return gi.Scene([gi.Node("all", [quad((-2, 0, 2), (4, 0, 0), (0, 0, -4), GREY, "floor"), *walls])])
+
+
+def test_slots_behind_a_floor_have_what_is_in_front():
+    """The post's texels just below the floor see the sky below; above it nobody sees those, but fetches read them."""
+    scene, settings, device = post_in_a_floor(1.0), transfer_settings(resolution=128), get_device("cpu")
+    atlas = make_atlas(scene, settings, "cpu")
+    traced = trace_slots(transfer_work(scene, atlas, settings, device, 0))
+    found = without_buried(atlas, traced)
+    points = scene._flat.points[scene._flat.indices[atlas.slot_faces]]
+    u, v = atlas.slot_points.T[:, :, None]
+    places = points[:, 0] * (1 - u - v) + points[:, 1] * u + points[:, 2] * v
+    normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+    wall = (np.abs(normal[:, 1]) < 1e-6) & (atlas.slot_sides == 0)
+    face = atlas.slot_faces[np.flatnonzero(wall)[0]]
+    edges = scene._flat.points[scene._flat.indices[face]][:2], atlas.corners[face][:2]
+    texel = np.linalg.norm(np.diff(edges[0], axis=0)) / np.linalg.norm(np.diff(edges[1], axis=0))  # m
+    below = wall & (places[:, 1] < 0) & (places[:, 1] > -1.5 * texel)
+    above = wall & (places[:, 1] > 0) & (places[:, 1] < 1.5 * texel)
+    assert below.sum() > 20 and above.sum() > 20
+    up = 1  # y of the harmonics: light from above less light from below
+    assert traced.transfer[below, up].mean() < -0.3 < 0.3 < traced.transfer[above, up].mean()
+    assert (found.transfer[below, up] > 0.1).mean() > 0.95
+    assert np.array_equal(found.transfer[above], traced.transfer[above])
+    replaced = np.flatnonzero((found.transfer != traced.transfer).any(axis=1))
+    assert not np.isin(found.hits, replaced).any()
+
+
+def test_slots_that_see_backs_as_their_neighbours_do_stay():
+    """Below a sheet of cloth, which has a back alone for them."""
+    cloth = quad((-2, 1, 2), (4, 0, 0), (0, 0, -4), GREY, "cloth")
+    scene = gi.Scene([gi.Node("all", [cloth, quad((-1, 0, 1), (2, 0, 0), (0, 0, -2), GREY, "floor")])])
+    settings = transfer_settings(resolution=64)
+    atlas = make_atlas(scene, settings, "cpu")
+    traced = trace_slots(transfer_work(scene, atlas, settings, get_device("cpu"), 0))
+    assert back_shares(atlas, traced.hits).max() > 0.5
+    assert without_buried(atlas, traced) is traced
 
 
 @pytest.mark.parametrize("sky", [1.0])

@@ -1,15 +1,13 @@
-"""Slots in awkward places: on the very edge of a face, where rays slip past its neighbour, and inside other objects."""
+"""Slots in awkward places: on the very edge of a face, where rays slip past its neighbour, inside other objects, and
+behind surfaces that cut theirs."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
-import warp as wp
 
-from warp_gi import launch
-from warp_gi.kernels.transfer_bake import SKY
-from warp_gi.kernels.transfer_bounces import spread_reach
+from warp_gi.kernels.transfer_bake import BLACK
 from warp_gi.techniques.radiance_transfer.rays import TracedTransfer
 from warp_gi.techniques.radiance_transfer.textures import Atlas
 
@@ -17,11 +15,11 @@ MARGIN = 0.1
 """Texels by which a slot keeps away from the edges of its face."""
 MOST_MARGIN = 0.3
 """Largest barycentric coordinate that this may take, in faces smaller than a texel."""
-REACHED = 0.25
-"""Share of a slot's rays that have to end where light gets, for light to get to the slot. Few of those inside an object
-may seem to, where the texel that is nearest to what they hit lies outside."""
+BEHIND, CLEAR = 0.2, 0.1
+"""Share of a slot's rays that meet backs, above which the slot may lie inside an object or behind a surface that cuts
+its own, and share up to which another stands in for it."""
 REACH = 3
-"""Texels from a buried slot in which another stands in for it: bilinear fetches of visible points read the first."""
+"""Texels from a slot in which another stands in for it: bilinear fetches of visible points read the first."""
 
 
 def off_edges(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -38,63 +36,51 @@ def off_edges(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     return (weights / weights.sum(axis=1, keepdims=True))[:, 1:].astype(np.float32)
 
 
-def without_buried(
-    atlas: Atlas, traced: TracedTransfer, lit: np.ndarray | None = None, device: wp.Device | None = None
-) -> TracedTransfer:
-    """Return what was traced, with that of the nearest slot in the open in place of that of slots inside objects.
+def without_buried(atlas: Atlas, traced: TracedTransfer) -> TracedTransfer:
+    """Return what was traced, with that of slots nearby in place of that of slots inside objects or behind surfaces.
 
-    A floor's texels below a box are black, and bilinear fetches beside the box read them. No light gets there, over
-    any number of bounces. Hits of such slots count as hits of those that stand in for them.
-
-    Args:
-        atlas: Where the slots are.
-        traced: What their rays find.
-        lit: Slots that lamps shine on, bool [slots]; None without lamps.
-        device: Where kernels run; None is the CPU.
+    A floor's texels below a box are black, and bilinear fetches beside the box read them. The texels of a post below
+    a floor see the sky from there, which nobody above does. Rays of both meet backs. Slots whose neighbours see as
+    many, as below a sheet of cloth, stay as they are. Hits of slots that were replaced count as hits of those that
+    stand in for them.
     """
     if atlas.corners.shape[0] == 0 or traced.hits.shape[1] == 0:
         return traced
-    buried = ~reached_slots(traced.hits, lit, device)
-    if not buried.any():
+    backs = back_shares(atlas, traced.hits)
+    stands_in = _stand_ins(atlas, backs > BEHIND, backs <= CLEAR)
+    if np.array_equal(stands_in, np.arange(atlas.count)):
         return traced
-    stands_in = _stand_ins(atlas, buried)
     hits = traced.hits[stands_in]
     hits = np.where(hits >= 0, stands_in[np.maximum(hits, 0)], hits)
     return replace(traced, transfer=traced.transfer[stands_in], hits=hits)
 
 
-def reached_slots(hits: np.ndarray, lit: np.ndarray | None = None, device: wp.Device | None = None) -> np.ndarray:
-    """Return the slots that light gets to, bool [slots]: that see the sky, are lit, or see enough of such slots."""
-    target = device or launch.get_device("cpu")
-    reached = (hits == SKY).any(axis=1)
-    if lit is not None:
-        reached |= lit
-    needed = int(REACHED * hits.shape[1]) + 1
-    rows = launch.on_device(hits, wp.int32, target)
-    dark = np.flatnonzero(~reached).astype(np.int32)
-    while len(dark):
-        known = launch.on_device(reached.astype(np.uint8), wp.uint8, target)
-        found = wp.zeros(len(dark), dtype=wp.uint8, device=target)
-        inputs = [launch.on_device(dark, wp.int32, target), rows, known, needed, found]
-        launch.launch(spread_reach, len(dark), inputs, target)
-        more = found.numpy() > 0
-        if not more.any():
-            break
-        reached[dark[more]] = True
-        dark = dark[~more]
-    return reached
+def back_shares(atlas: Atlas, hits: np.ndarray) -> np.ndarray:
+    """Return the share of each slot's rays that meet the back of a surface, float32 [slots].
+
+    Where nothing is kept counts as a back: those of closed objects keep nothing.
+    """
+    count = np.zeros(len(hits), np.int32)
+    for ray in range(hits.shape[1]):
+        hit = hits[:, ray]
+        count += (hit == BLACK) | ((hit >= 0) & (atlas.slot_sides[np.maximum(hit, 0)] == 1))
+    return (count / max(hits.shape[1], 1)).astype(np.float32)
 
 
-def _stand_ins(atlas: Atlas, buried: np.ndarray) -> np.ndarray:
-    """Return for each slot itself or, if it is buried, the nearest one of its chart that is not, int32 [slots]."""
-    result = np.where(buried, -1, np.arange(atlas.count)).astype(np.int32)
+def _stand_ins(atlas: Atlas, wanted: np.ndarray, offered: np.ndarray) -> np.ndarray:
+    """Return for each slot itself or, if it is ``wanted``, the nearest of its chart that is ``offered``, int32 [slots].
+
+    A slot that is wanted and finds none within `REACH` texels stays itself.
+    """
+    result = np.where(offered, np.arange(atlas.count), -1).astype(np.int32)
+    result[wanted] = -1
     charts = atlas.charts[atlas.slot_faces]
     steps = sorted(((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j), key=lambda step: abs(step[0] * step[1]))
     for start, width, height in atlas.pages.tolist():
         for side in range(2):
             grid = np.full((height + 2, width + 2), -1, np.int32)
             grid[1:-1, 1:-1] = atlas.slots[side, start : start + width * height].reshape(height, width)
-            rows, columns = np.nonzero((grid >= 0) & buried[np.maximum(grid, 0)])
+            rows, columns = np.nonzero((grid >= 0) & wanted[np.maximum(grid, 0)])
             slots = grid[rows, columns]
             for _ in range(REACH):
                 found = np.full(len(slots), -1, np.int32)
