@@ -21,12 +21,13 @@ from warp_gi.kernels.transfer_lobes import (
     table_place,
     unshaded_radiance,
 )
-from warp_gi.kernels.transfer_products import bounced_product, environment_product, glossy_product
+from warp_gi.kernels.transfer_products import LIGHT_WIDTH, bounced_product, environment_product, glossy_product
 from warp_gi.kernels.types import SceneData
 
 wp.set_module_options({"enable_backward": False})
 
 MEAN_OF_FIRST = wp.constant(wp.float32(0.2820948))  # a sky's mean over its first coefficient
+FIRST_OF_WHITE = wp.constant(wp.float32(3.5449077))  # first coefficient of a sky of radiance 1
 LEAST_OF_MEAN = wp.constant(wp.float32(0.05))  # what the light of an open lobe counts as at least, in means of the sky
 BROAD = wp.constant(wp.float32(0.7))  # roughness of the lobe, at least, by which occlusion is told
 MOST_SHARE = wp.constant(wp.float32(1.5))  # of the light of an open lobe
@@ -49,6 +50,8 @@ class TransferSky:
     matrix: wp.array(dtype=wp.float32)  # [order^2, 3, width] of light without suns: sum_i C_ijk L_i, for lobes
     lobes: LobeTable
     prefiltered: PrefilteredSky  # without suns
+    least: wp.vec3  # radiance of the darkest part of the sky
+    most: wp.vec3  # of the brightest part, without suns
     scale: wp.float32  # of its radiance
     environment_from_world: wp.mat33
     sun_count: wp.int32
@@ -65,12 +68,30 @@ def surface_slots(
     return atlas_fetch(rows.atlas, face, u, v, side_seen(scene, face, -s.normal))
 
 
+# Irradiance [W/m^2] of the sky, without suns, that nothing reflected before; within what the sky can bring where a sky
+# of radiance 1 brings `white`. The harmonics of a sky with a few bright parts swing far about the others.
+@wp.func
+def sky_irradiance(rows: TransferRows, sky: TransferSky, at: SlotFetch) -> wp.vec3:
+    light = environment_product(rows.transfer, at.slots, at.shares, sky.light)
+    white = float(0.0)
+    for k in range(4):
+        white += wp.float32(rows.transfer[at.slots[k], 0]) * at.shares[k]
+    white = wp.max(white, 0.0) * FIRST_OF_WHITE
+    return wp.min(wp.max(light, sky.least * white), sky.most * white)
+
+
 # Irradiance [W/m^2] of light that was reflected before.
 @wp.func
 def bounced_irradiance(rows: TransferRows, sky: TransferSky, at: SlotFetch) -> wp.vec3:
     light = wp.vec3(0.0, 0.0, 0.0)
     if rows.bounces.shape[0] > 0:
-        light = wp.max(bounced_product(rows.bounces, at.slots, at.shares, sky.whole_light), light)
+        white = wp.vec3(0.0, 0.0, 0.0)
+        for k in range(4):
+            for c in range(3):
+                white[c] = white[c] + wp.float32(rows.bounces[at.slots[k], c * LIGHT_WIDTH]) * at.shares[k]
+        white = wp.max(white, light) * FIRST_OF_WHITE
+        light = bounced_product(rows.bounces, at.slots, at.shares, sky.whole_light)
+        light = wp.max(light, wp.cw_mul(sky.least, white))
     if rows.lamps.shape[0] > 0:
         for k in range(4):
             light = light + rows.lamps[at.slots[k]] * at.shares[k]
@@ -93,11 +114,11 @@ def sun_radiance(scene: SceneData, sky: TransferSky, s: Surface, b: Bsdf, wo: wp
     return sum
 
 
-# Radiance of the sky, without suns, that a diffuse lobe reflects. A sum of few harmonics may be below 0.
+# Radiance of the sky, without suns, that a diffuse lobe reflects.
 @wp.func
 def diffuse_radiance(rows: TransferRows, sky: TransferSky, s: Surface, at: SlotFetch) -> wp.vec3:
-    irradiance = environment_product(rows.transfer, at.slots, at.shares, sky.light)
-    return wp.cw_mul(wp.cw_mul(diffuse_share(s.bsdf), s.bsdf.diffuse), irradiance) / wp.pi
+    diffuse = wp.cw_mul(diffuse_share(s.bsdf), s.bsdf.diffuse)
+    return wp.cw_mul(diffuse, sky_irradiance(rows, sky, at)) / wp.pi
 
 
 # Radiance of the sky, without suns, that the glossy lobe reflects towards the unit direction `view`: by transfer alone

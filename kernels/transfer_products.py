@@ -11,7 +11,7 @@ from warp_gi.kernels.transfer_snippets import COSINE, HARMONICS, HAS_VECTOR_HALV
 wp.set_module_options({"enable_backward": False})
 
 WIDTHS = {5: 32, 6: 40}  # numbers in a row, with padding
-LIGHT_WIDTH = WIDTHS[LIGHT_ORDER]  # of the sky's own numbers, and of what bounces
+LIGHT_WIDTH = wp.constant(WIDTHS[LIGHT_ORDER])  # of the sky's own numbers, and of what bounces
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
 
 

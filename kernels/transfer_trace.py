@@ -33,10 +33,10 @@ from warp_gi.kernels.transfer_light import (
     bounced_irradiance,
     diffuse_radiance,
     is_kept,
+    sky_irradiance,
     sun_radiance,
     surface_slots,
 )
-from warp_gi.kernels.transfer_products import environment_product
 from warp_gi.kernels.transfer_shade import (
     WANTS_ENVIRONMENT,
     WANTS_INDIRECT,
@@ -90,8 +90,7 @@ def leaving_radiance(
         return light
     sky = samplers.cache.sky
     rows = samplers.cache.rows
-    irradiance = wp.max(environment_product(rows.transfer, at.slots, at.shares, sky.light), wp.vec3())
-    irradiance = irradiance + bounced_irradiance(rows, sky, at)
+    irradiance = sky_irradiance(rows, sky, at) + bounced_irradiance(rows, sky, at)
     light = light + wp.cw_mul(average_reflectance(s.bsdf), irradiance) / wp.pi
     if sky.sun_count > 0:
         u = wp.vec2(0.0, 0.0)
@@ -129,7 +128,7 @@ def lobe_light(
 @wp.func
 def diffuse_light(scene: SceneData, cache: TransferCache, s: Surface, at: SlotFetch, u: wp.vec2) -> TracedLight:
     r = TracedLight()
-    r.environment = wp.max(diffuse_radiance(cache.rows, cache.sky, s, at), wp.vec3(0.0, 0.0, 0.0))
+    r.environment = diffuse_radiance(cache.rows, cache.sky, s, at)
     diffuse = wp.cw_mul(diffuse_share(s.bsdf), s.bsdf.diffuse)
     if cache.sky.sun_count > 0:
         r.environment = r.environment + sun_radiance(scene, cache.sky, s, lambert(diffuse), UP, u)

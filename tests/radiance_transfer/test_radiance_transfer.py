@@ -13,6 +13,7 @@ from truth_tools import sky_nodes, sky_of
 import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench.harness.court import court, court_camera
+from warp_gi.techniques.radiance_transfer.sky import radiance_range
 
 BAKE = {"resolution": 96, "rays": 256, "first_rays": 64}
 DIRECT = gi.RadianceTransfer(**BAKE)
@@ -283,3 +284,26 @@ def test_a_sky_of_lamps_warns():
     pixels[20, 40] = pixels[24, 90] = 2000.0
     with pytest.warns(UserWarning, match="2 small lamps hold"):
         rendered(corner(gi.Environment(pixels=pixels)), pipeline(indirect=None))
+
+
+def test_a_dark_part_of_the_sky_brings_no_less_than_the_darkest():
+    """The floor of a pit sees a dark zenith alone, where the harmonics of a bright horizon swing far below 0."""
+    pixels = np.full((64, 128, 3), 0.2, np.float32)
+    pixels[20:44] = 4.0
+    walls = [
+        quad((-1, 0, -1), (2, 0, 0), (0, 6, 0), GREY),
+        quad((1, 0, 1), (-2, 0, 0), (0, 6, 0), GREY),
+        quad((-1, 0, 1), (0, 0, -2), (0, 6, 0), GREY),
+        quad((1, 0, -1), (0, 0, 2), (0, 6, 0), GREY),
+    ]
+    floor = quad((-1, 0, 1), (2, 0, 0), (0, 0, -2), GREY)
+    scene = gi.Scene([gi.Node("pit", [floor, *walls])], environment=gi.Environment(pixels=pixels))
+    camera = gi.Camera.look_at((0, 1.5, 0.1), (0, 0, 0), hfov=50, resolution=(16, 16))
+    used = pipeline(environment=gi.RadianceTransfer(resolution=64, bounces=0), indirect=None)
+    mine = next(gi.render(scene, camera, used)).numpy("environment")
+    known = next(gi.render(scene, camera, gi.Pipeline(indirect=None, spp=1024))).numpy("environment")
+    assert mine.mean() == pytest.approx(known.mean(), rel=0.1)
+    assert radiance_range(scene.environment) == (pytest.approx([0.2] * 3), pytest.approx([4.0] * 3))
+    turned = radiance_range(gi.Environment(pixels=pixels, rotation=70.0, scale=2.0))
+    assert turned == (pytest.approx([0.4] * 3), pytest.approx([8.0] * 3))
+    assert radiance_range(gi.Environment.constant((1.0, 2.0, 3.0))) == (pytest.approx([1, 2, 3]),) * 2

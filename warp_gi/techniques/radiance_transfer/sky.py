@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from warp_gi.scene.baked import BakedScene
     from warp_gi.scene.scene import Scene
 
+CELLS = 32
+"""Parts of a sky between its poles whose radiance bounds the light; features of 25 numbers are six times as wide."""
+
 
 @dataclass(frozen=True, eq=False)
 class SkyLight:
@@ -100,6 +103,8 @@ class TransferLight(Service):
         result.lobes = lobes_on_device(self.lobe, order, device.alias)
         result.environment_from_world = wp.mat33(*rest.world_from_environment.T.ravel())
         result.scale = rest.scale
+        least, most = radiance_range(rest)
+        result.least, result.most = wp.vec3(*least), wp.vec3(*most)
         maps = prefiltered(rest)
         result.prefiltered.texels = maps.on(device)
         result.prefiltered.levels, result.prefiltered.rows = maps.levels.shape[:2]
@@ -121,6 +126,29 @@ def lobes_on_device(lobe: str, order: int, device: str) -> transfer_lobes.LobeTa
     table.lookups = on_device(sky_lookups(), wp.float32, get_device(device))
     table.smallest, table.is_white = SMALLEST_ROUGHNESS, int(lobe != "phong")
     return table
+
+
+def radiance_range(sky: Environment) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the most radiance of parts of a sky, W/(m^2 sr), float64 [3] each.
+
+    Parts are means over CELLS x 2 CELLS pieces of the map, so that a black texel among others does not count.
+    """
+    found = sky.once_a_map("radiance transfer: range", _range_of)
+    if found is None:
+        color = np.array(sky.color or (0.0, 0.0, 0.0), np.float64)
+        found = color, color
+    return found[0] * sky.scale, found[1] * sky.scale
+
+
+def _range_of(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    cells = pixels.astype(np.float64)
+    for axis, most in ((0, CELLS), (1, 2 * CELLS)):
+        count = cells.shape[axis]
+        if count > most:
+            starts = np.arange(most) * count // most
+            sizes = np.diff(np.append(starts, count)).reshape((-1, 1) if axis else (-1, 1, 1))
+            cells = np.add.reduceat(cells, starts, axis=axis) / sizes
+    return cells.min(axis=(0, 1)), cells.max(axis=(0, 1))
 
 
 def _padded(light: np.ndarray, width: int) -> np.ndarray:
