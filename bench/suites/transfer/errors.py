@@ -137,7 +137,8 @@ def one_sky_rows(
     case: str, sky: str, view: TermView, base: gi.RadianceTransfer, bake: gi.Bake, gallery: Gallery
 ) -> list[Row]:
     """Return the rows of one sky; the share is of its light that suns hold."""
-    ways: dict[str, tuple[Any, int]] = {"sun apart": (base, EDGES), "no sun apart": (replace(base, sun=0.0), EDGES)}
+    suns = {"sun apart": base.sun, "sun apart from 5 means": 5.0, "no sun apart": 0.0}
+    ways: dict[str, tuple[Any, int]] = {way: (replace(base, sun=sun), EDGES) for way, sun in suns.items()}
     for spp in (16, 64):
         ways[f"traced, {spp} samples"] = (gi.TracedEnvironment(), spp)
     environment = view.scene.environment

@@ -25,6 +25,7 @@ WAYS: dict[str, dict[str, Any]] = {
     "TPFL": {"glossy": "transfer", "sun": 0.0},
     "TPFL and sun": {"glossy": "transfer"},
     "ratio and sun": {"glossy": "ratio"},
+    "default": {},
     "diffuse": {"glossy": "transfer", "sun": 0.0},
     "diffuse and sun": {"glossy": "transfer"},
 }

@@ -145,6 +145,7 @@ _FRAME = Region(
                 GridColumn("whole frame", _less("frame", "TPFL")),
                 GridColumn("sun apart: term", Figure("term: times less, cpu", {"way": "TPFL and sun"})),
                 GridColumn("sun apart, ratio form: term", Figure("term: times less, cpu", {"way": "ratio and sun"})),
+                GridColumn("default: term", Figure("term: times less, cpu", {"way": "default"})),
                 GridColumn("Lambert: term", Figure("term: times less, cpu", {"way": "diffuse"})),
                 GridColumn("TPFL at 1920x1080, ms", Figure("term cpu ms", {"way": "TPFL"}, table="frames: 1920x1080")),
             ),
@@ -189,6 +190,7 @@ _ERROR = Region(
             (
                 GridColumn("light of suns, %", Figure("share of suns", {"way": "sun apart"}, scale=100.0)),
                 GridColumn("sun apart", Figure("rel", {"way": "sun apart"})),
+                GridColumn("`sun=5`", Figure("rel", {"way": "sun apart from 5 means"})),
                 GridColumn("all in harmonics", Figure("rel", {"way": "no sun apart"})),
                 GridColumn("traced, 16 samples", Figure("rel", {"way": "traced, 16 samples"})),
                 GridColumn("traced, 64 samples", Figure("rel", {"way": "traced, 64 samples"})),

@@ -63,14 +63,14 @@ def room(rows: int) -> gi.Scene:
 
 
 def dragon(size: int) -> gi.Scene:
-    """Return the Stanford dragon, 2 m long, on a ground of two triangles."""
+    """Return the Stanford dragon, 2 m long and smooth, on a ground of two triangles."""
     loaded = gi.load_scene(SCENES / DRAGON, scale=10.0)
     low, _ = loaded.bounds
     lowered = np.eye(4)
     lowered[1, 3] = -low[1]
     nodes = []
     for node in loaded.nodes:
-        meshes = [replace(mesh, material=GREY) for mesh in node.meshes]
+        meshes = [replace(mesh, material=GREY, normals=_normals(mesh.points, mesh.indices)) for mesh in node.meshes]
         nodes.append(replace(node, meshes=meshes, parent_from_node=lowered @ node.parent_from_node))
     return gi.Scene([*nodes, ground()], name="dragon")
 
