@@ -32,7 +32,7 @@ class SurfaceCells:
     low: wp.vec3  # corner of the first cell, metres
     side: wp.float32  # of a cell of level 0, metres
     growth: wp.float32  # largest side of a cell over its distance from the camera's path, above level 0
-    smooth: wp.float32  # roughness below which the GGX lobe is traced, and not read
+    traced_below: wp.float32  # roughness below which the GGX lobe is traced, and not read
     boxes: wp.array(dtype=wp.vec3)  # [2 * box] low and high corners around pieces of the camera's path, metres
     bits: wp.int32  # the table has 2^bits slots, and a few more
     keys: wp.array(dtype=wp.uint64)  # [slot]; 0: empty
@@ -164,7 +164,7 @@ def cell_exitance(cells: SurfaceCells, slot: wp.int32, b: Bsdf, with_lobe: wp.in
 # Probability of tracing a lobe that is too smooth to be read.
 @wp.func
 def surface_lobe(cells: SurfaceCells, s: Surface, wo: wp.vec3) -> wp.float32:
-    if s.bsdf.f90 <= 0.0 or s.bsdf.alpha >= cells.smooth * cells.smooth:
+    if s.bsdf.f90 <= 0.0 or s.bsdf.alpha >= cells.traced_below * cells.traced_below:
         return 0.0
     return wp.max(specular_probability(s.bsdf, wo[2]), LEAST_LOBE)
 

@@ -208,7 +208,7 @@ def test_a_fill_needs_a_camera():
         ({"vertices": 65}, "vertices must be a whole number from 1 to 64"),
         ({"cell": -1.0}, "cell must be finite and not negative, got -1"),
         ({"growth": float("nan")}, "growth must be finite"),
-        ({"smooth": 1.5}, "smooth must be a roughness from 0 to 1, got 1.5"),
+        ({"traced_below": 1.5}, "traced_below must be a roughness from 0 to 1, got 1.5"),
     ],
 )
 def test_settings_out_of_range(settings, told):

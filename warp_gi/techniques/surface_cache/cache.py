@@ -54,7 +54,7 @@ class SurfaceCache(RadianceCache):
     """Largest number of cells, of 80 bytes each with the empty places of the table. Those with the fewest samples find
     no place, and a warning tells of them."""
 
-    smooth: float = 0.2
+    traced_below: float = 0.2
     """Roughness below which the specular lobe of a surface where a path ends is traced by one more ray, not read."""
 
     def validate(self) -> None:
@@ -67,8 +67,8 @@ class SurfaceCache(RadianceCache):
             if not (math.isfinite(value) and value >= 0):
                 raise OptionError(f"{name} must be finite and not negative, got {value}")
 
-        if not 0 <= self.smooth <= 1:
-            raise OptionError(f"smooth must be a roughness from 0 to 1, got {self.smooth}")
+        if not 0 <= self.traced_below <= 1:
+            raise OptionError(f"traced_below must be a roughness from 0 to 1, got {self.traced_below}")
 
     @property
     def fill_settings(self) -> FillSettings:
@@ -153,7 +153,7 @@ class SurfaceCache(RadianceCache):
                 f"this bake of {bake.scene_name!r} does not hold a surface cache that fits together: bake again"
             )
         grid: SurfaceCells = grid_at(arrays["low"], float(arrays["side"][0]), self.growth, arrays["boxes"], target)
-        grid.smooth = self.smooth
+        grid.traced_below = self.traced_below
         return with_table(grid, arrays["keys"], arrays["cells"], target)
 
     # ---- frames ----
