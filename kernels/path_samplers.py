@@ -106,7 +106,8 @@ class PathCache(NamedTuple):
 
     name: str
     data: Any  # struct
-    # (data, scene, surface with its colour, wo in the frame of shading, BvhHit, two random numbers) -> KnownRadiance
+    # (data, scene, surface with its colour, wo in the frame of shading, BvhHit, least density [1/sr] of the directions
+    # that led here: how sharply the camera sees the surface, two random numbers) -> KnownRadiance
     lookup: wp.Function
     holds_direct: bool = False  # such a cache is read from the second vertex on
     # (data, surface, wo) -> probability with which a path goes on by the GGX lobe alone, which is not in what is known;
@@ -304,7 +305,9 @@ class NoCache:
 
 
 @wp.func
-def nothing_known(data: NoCache, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit, u: wp.vec2) -> KnownRadiance:
+def nothing_known(
+    data: NoCache, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit, pdf: wp.float32, u: wp.vec2
+) -> KnownRadiance:
     return KnownRadiance()
 
 

@@ -185,6 +185,7 @@ def _made(
         # the same by the BSDF alone: roulette must not end paths for going where light was expected, which lowers it
         reflected = wp.vec3(1.0, 1.0, 1.0)
         samples_sky = sky.is_sampled(samplers.sky, scene)
+        sharpness = float(wp.inf)
         for depth in range(2, paths.max_depth + 1):
             at_first = depth == 2
             d = PATH_DIMENSION + (depth - 2) * VERTEX_DIMENSIONS
@@ -205,7 +206,7 @@ def _made(
                     s = with_color(scene, s)
                     u_first = random_1d(index, seed, d + CACHE_PLACE_DIMENSION)
                     u_place = wp.vec2(u_first, random_1d(index, seed, d + CACHE_PLACE_DIMENSION + 1))
-                    known = cache.lookup(samplers.cache, scene, s, wo, hit, u_place)
+                    known = cache.lookup(samplers.cache, scene, s, wo, hit, sharpness, u_place)
                     ends = known.validity >= 1.0
                     if known.validity > 0.0 and not ends:
                         ends = random_1d(index, seed, d + CACHE_DIMENSION) < known.validity
@@ -355,6 +356,8 @@ def _made(
                     break
                 throughput = throughput / survival
                 reflected = reflected / survival
+            if has_cache:
+                sharpness = wp.min(sharpness, b.pdf)
             view = -wi
             s = surface_shape(scene, hit.face, hit.u, hit.v, view)
         if slot >= 0:

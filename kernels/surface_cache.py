@@ -21,7 +21,7 @@ LEVELS = wp.constant(5)  # sizes of cells that a point lies in, each twice the o
 READ_LEVELS = wp.constant(3)  # that paths of a picture read; the others are for the ends of paths that fill cells
 LARGEST_LEVEL = wp.constant(10)  # of the smallest of them, so that the key has room for all
 LARGEST_COORDINATE = wp.constant((1 << 19) - 1)  # of a cell of level 0, along an axis
-NEAR = wp.constant(wp.float32(0.5))  # sides of a cell below which a hit is too near to the vertex before to read there
+NEAR = wp.constant(wp.float32(0.5))  # sides of a cell below which matt surfaces are too near to each other to read one
 LEAST_LOBE = wp.constant(wp.float32(0.3))  # probability, at least, of tracing a lobe that is not read
 
 
@@ -169,15 +169,18 @@ def surface_lobe(cells: SurfaceCells, s: Surface, wo: wp.vec3) -> wp.float32:
     return wp.max(specular_probability(s.bsdf, wo[2]), LEAST_LOBE)
 
 
-# Radiance of all light that a surface reflects towards wo, but for a lobe that is traced. Nothing is known where the
-# vertex before is nearer than half a cell: a corner's light differs within it.
+# Radiance of all light that a surface reflects towards wo, but for a lobe that is traced. Nothing is known where cells
+# would show: in corners, whose light differs within a cell, and in mirrors. A sample of direction stands for the solid
+# angle 1 / pdf, which a ray of length t widens to an area of t^2 / pdf; cells are read where that is as large as it is
+# at NEAR sides of a cell from a matt surface, whose pdf is up to 1 / pi.
 @wp.func
 def surface_lookup(
-    cells: SurfaceCells, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit, u: wp.vec2
+    cells: SurfaceCells, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit, pdf: wp.float32, u: wp.vec2
 ) -> KnownRadiance:
     known = KnownRadiance()
     level = cell_level(cells, s.position)
-    if hit.t < NEAR * cells.side * wp.float32(1 << level):
+    nearest = NEAR * cells.side * wp.float32(1 << level)
+    if hit.t * hit.t < wp.pi * pdf * nearest * nearest:
         return known
     slot = known_slot(cells, s, level, READ_LEVELS, u)
     if slot >= 0:

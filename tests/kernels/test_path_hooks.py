@@ -258,7 +258,7 @@ class SteadyCache:
 
 @wp.func
 def steady_lookup(
-    data: SteadyCache, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit, u: wp.vec2
+    data: SteadyCache, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit, pdf: wp.float32, u: wp.vec2
 ) -> KnownRadiance:
     if data.colored != 0:
         return KnownRadiance(wp.cw_mul(data.radiance, s.base_color), data.validity)

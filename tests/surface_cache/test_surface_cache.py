@@ -104,6 +104,23 @@ def test_pictures_have_the_mean_of_long_paths_and_less_noise():
     assert noise["cache"] < 0.5 * noise["paths"], noise
 
 
+def test_a_mirror_shows_no_cells():
+    """The edge of a shadow, seen in a mirror, is as sharp as by paths: cells are not read so near to it."""
+    mirror = gi.Material("mirror", (0.9, 0.9, 0.9), metallic=1.0, roughness=0.03)
+    floor = quad((-2, 0, 2), (4, 0, 0), (0, 0, -4))
+    wall = quad((-2, 0, -1), (4, 0, 0), (0, 3, 0), mirror)
+    lid = quad((0, 2, 2), (0, 0, -4), (2, 0, 0))
+    sun = gi.PunctualLight("directional", intensity=(3.0, 3.0, 3.0), direction=(0, -1, 0))
+    scene = scene_of(floor, wall, lid, lights=[sun])
+    camera = gi.Camera.look_at((0, 0.9, 0.8), (0, 0.4, -1), hfov=40, resolution=(32, 24))
+    cache = replace(SMALL, cell=0.3)
+    bake = baked(scene, camera, cache)
+    reference = indirect(scene, camera, replace(TRACED, spp=64))
+    found = indirect(scene, camera, ending(cache, spp=64), [bake])
+    assert reference[:, :12].mean() > 0.2 > 0.08 > reference[:, 20:].mean()
+    assert np.sqrt(((found - reference) ** 2).mean()) < 0.04 * reference.mean()
+
+
 def test_an_empty_cache_changes_no_bit():
     """Where nothing is known paths go on, to the same light."""
     scene, camera = cornell(24, 24)
