@@ -172,7 +172,7 @@ def surface_lobe(cells: SurfaceCells, s: Surface, wo: wp.vec3) -> wp.float32:
 # Radiance of all light that a surface reflects towards wo, but for a lobe that is traced. Nothing is known where cells
 # would show: in corners, whose light differs within a cell, and in mirrors. A sample of direction stands for the solid
 # angle 1 / pdf, which a ray of length t widens to an area of t^2 / pdf; cells are read where that is as large as it is
-# at NEAR sides of a cell from a matt surface, whose pdf is up to 1 / pi.
+# at NEAR sides of a cell from a matt surface, whose pdf is up to 1 / pi, and no nearer.
 @wp.func
 def surface_lookup(
     cells: SurfaceCells, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit, pdf: wp.float32, u: wp.vec2
@@ -180,7 +180,7 @@ def surface_lookup(
     known = KnownRadiance()
     level = cell_level(cells, s.position)
     nearest = NEAR * cells.side * wp.float32(1 << level)
-    if hit.t * hit.t < wp.pi * pdf * nearest * nearest:
+    if hit.t * hit.t < wp.max(wp.pi * pdf, 1.0) * nearest * nearest:
         return known
     slot = known_slot(cells, s, level, READ_LEVELS, u)
     if slot >= 0:

@@ -7,6 +7,7 @@ depends on the number of threads.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,10 +55,15 @@ class Sums:
         )
 
     def __add__(self, other: Sums) -> Sums:
+        return Sums.all_of([self, other]) if len(self.keys) else other
+
+    @staticmethod
+    def all_of(several: Sequence[Sums]) -> Sums:
+        """Return the sums of several; cells may be in more than one."""
         return Sums.of(
-            np.concatenate([self.keys, other.keys]),
-            np.concatenate([self.light, other.light]),
-            np.concatenate([self.counts, other.counts]),
+            np.concatenate([one.keys for one in several]),
+            np.concatenate([one.light for one in several]),
+            np.concatenate([one.counts for one in several]),
         )
 
     def without(self, other: Sums) -> Sums:
@@ -67,11 +73,11 @@ class Sums:
 
     def with_levels(self) -> Sums:
         """Return the sums of these cells, the smallest at each point, and of those of the levels above them."""
-        level, total = self, self
+        levels = [self]
         for _ in range(int(LEVELS) - 1):
-            level = Sums.of(coarser(level.keys), level.light, level.counts)
-            total = total + level
-        return total
+            below = levels[-1]
+            levels.append(Sums.of(coarser(below.keys), below.light, below.counts))
+        return Sums.all_of(levels)
 
     def most_sampled(self, capacity: int) -> tuple[Sums, int]:
         """Return the cells with enough samples, at most ``capacity``, and the number of those without a place."""
