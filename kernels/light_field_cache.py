@@ -86,7 +86,9 @@ class ProbeCache:
 
 
 @wp.func
-def probe_lookup(data: ProbeCache, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit) -> KnownRadiance:
+def probe_lookup(
+    data: ProbeCache, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit, pdf: wp.float32, u: wp.vec2
+) -> KnownRadiance:
     seen = seen_light(scene, data.field, data.visibility, s.position, shading_normal(s), ray_origin(s))
     return KnownRadiance(cached_radiance(s, seen), seen.trust)
 

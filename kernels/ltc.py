@@ -137,6 +137,20 @@ def coat_fresnel(b: Bsdf, cos_o: wp.float32) -> wp.vec3:
     return b.f0 * (1.0 - s) + wp.vec3(b.f90 * s, b.f90 * s, b.f90 * s)
 
 
+# What the GGX lobe reflects of light from a direction with this cosine: f0 times the first, f90 times the second.
+@wp.func
+def lobe_albedo(table: LtcTable, alpha: wp.float32, cosine: wp.float32) -> wp.vec2:
+    last = wp.float32(table.size - 1)
+    x = wp.clamp(wp.sqrt(wp.max(1.0 - cosine, 0.0)) * last, 0.0, last - 1.0e-3)
+    y = wp.clamp(wp.sqrt(alpha) * last, 0.0, last - 1.0e-3)
+    i = wp.int32(y) * table.size + wp.int32(x)
+    j = i + table.size
+    fx = x - wp.floor(x)
+    fy = y - wp.floor(y)
+    low = (1.0 - fx) * table.amplitudes[i] + fx * table.amplitudes[i + 1]
+    return (1.0 - fy) * low + fy * ((1.0 - fx) * table.amplitudes[j] + fx * table.amplitudes[j + 1])
+
+
 # Weights of the lobes at a point that is seen from wo; nothing is reflected where wo is not above the surface.
 @wp.func
 def lobe_weights(table: LtcTable, bsdf: Bsdf, wo: wp.vec3) -> LobeWeights:

@@ -100,13 +100,19 @@ class PathCache(NamedTuple):
 
     `lookup` returns what the surface reflects towards `wo` of all light that the vertex's own light and direction
     samples do not hold: of light that was reflected or scattered before, from everywhere. Direct light of emitters and
-    of the sky is sampled there as without a cache.
+    of the sky is sampled there as without a cache. A cache that holds that light as well says so by `holds_direct`;
+    then nothing is sampled where a path ends, but for the GGX lobe of surfaces for which `lobe` is not 0.
     """
 
     name: str
     data: Any  # struct
-    # (data, scene, surface with its colour, wo in the frame of shading, BvhHit) -> KnownRadiance
+    # (data, scene, surface with its colour, wo in the frame of shading, BvhHit, least density [1/sr] of the directions
+    # that led here: how sharply the camera sees the surface, two random numbers) -> KnownRadiance
     lookup: wp.Function
+    holds_direct: bool = False  # such a cache is read from the second vertex on
+    # (data, surface, wo) -> probability with which a path goes on by the GGX lobe alone, which is not in what is known;
+    # 0: it is. Asked where the path would end in a cache that holds direct light.
+    lobe: wp.Function | None = None
 
 
 # What a radiance cache says of a vertex.
@@ -299,8 +305,16 @@ class NoCache:
 
 
 @wp.func
-def nothing_known(data: NoCache, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit) -> KnownRadiance:
+def nothing_known(
+    data: NoCache, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit, pdf: wp.float32, u: wp.vec2
+) -> KnownRadiance:
     return KnownRadiance()
+
+
+# For caches that know the light of every lobe.
+@wp.func
+def no_lobe(data: Any, s: Surface, wo: wp.vec3) -> wp.float32:
+    return 0.0
 
 
 ALIAS_LIGHTS = LightSampler("alias", AliasLights, alias_light, alias_light_pdf)

@@ -42,10 +42,13 @@ from warp_gi.kernels.path_samplers import (
     Regions,
     Sky,
     no_light,
+    no_lobe,
     sample_weight,
 )
 from warp_gi.kernels.sampling import (
     CACHE_DIMENSION,
+    CACHE_LOBE_DIMENSION,
+    CACHE_PLACE_DIMENSION,
     DIRECTION_DIMENSION,
     EMITTER_DIMENSION,
     LIGHT_DIMENSION,
@@ -144,6 +147,7 @@ def _made(
     lights: LightSampler, directions: DirectionSampler, regions: Regions, sky: Sky, cache: PathCache
 ) -> PathTracer:
     light_data, direction_data, region_data = lights.data, directions.data, regions.data
+    holds_direct, lobe_probability = cache.holds_direct, cache.lobe or no_lobe
     sky_data, cache_data, has_cache = sky.data, cache.data, cache is not NO_CACHE
     explore, choices = (no_light, 1) if lights.explore is None else (lights.explore, 2)
 
@@ -181,6 +185,7 @@ def _made(
         # the same by the BSDF alone: roulette must not end paths for going where light was expected, which lowers it
         reflected = wp.vec3(1.0, 1.0, 1.0)
         samples_sky = sky.is_sampled(samplers.sky, scene)
+        sharpness = float(wp.inf)
         for depth in range(2, paths.max_depth + 1):
             at_first = depth == 2
             d = PATH_DIMENSION + (depth - 2) * VERTEX_DIMENSIONS
@@ -189,7 +194,8 @@ def _made(
             at = regions.at(samplers.regions, slot, vertices)
             if at >= 0:
                 regions.begin(samplers.regions, at, s)
-            # All but the direct light may be known here; then the path ends, whatever edges it has left. Learners get
+            # All but the direct light may be known here; then the path ends, whatever edges it has left. Where direct
+            # light is known as well the path ends without samples of lights, or goes on by a lobe alone. Learners get
             # the vertex and its light samples as ever. Of its direction they get none, not even of one that leaves for
             # the sky: nobody knows how much of what is known came from there, and skies alone would seem to be all.
             # The vertices before it learn what is known here as light that came their way, as `end` tells them all
@@ -198,12 +204,24 @@ def _made(
             if has_cache:
                 if depth > paths.cache_vertex and (not at_first or (paths.terms & TERM_INDIRECT) != 0):
                     s = with_color(scene, s)
-                    known = cache.lookup(samplers.cache, scene, s, wo, hit)
+                    u_first = random_1d(index, seed, d + CACHE_PLACE_DIMENSION)
+                    u_place = wp.vec2(u_first, random_1d(index, seed, d + CACHE_PLACE_DIMENSION + 1))
+                    known = cache.lookup(samplers.cache, scene, s, wo, hit, sharpness, u_place)
                     ends = known.validity >= 1.0
                     if known.validity > 0.0 and not ends:
                         ends = random_1d(index, seed, d + CACHE_DIMENSION) < known.validity
                     if ends:
                         r.indirect = r.indirect + wp.cw_mul(throughput, known.radiance)
+                    if holds_direct:
+                        if ends:
+                            lobe = lobe_probability(samplers.cache, s, wo)
+                            if random_1d(index, seed, d + CACHE_LOBE_DIMENSION) >= lobe:
+                                vertices += 1
+                                break
+                            ends = False
+                            throughput = throughput / lobe
+                            reflected = reflected / lobe
+                            s.bsdf.diffuse = wp.vec3(0.0, 0.0, 0.0)
             # which lights to sample: both at the first vertex, where they are two terms; else one of them
             sky_share = paths.sky_probability
             emitter_share = 1.0 - sky_share
@@ -338,6 +356,8 @@ def _made(
                     break
                 throughput = throughput / survival
                 reflected = reflected / survival
+            if has_cache:
+                sharpness = wp.min(sharpness, b.pdf)
             view = -wi
             s = surface_shape(scene, hit.face, hit.u, hit.v, view)
         if slot >= 0:

@@ -185,7 +185,9 @@ class TransferCache:
 
 
 @wp.func
-def transfer_lookup(data: TransferCache, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit) -> KnownRadiance:
+def transfer_lookup(
+    data: TransferCache, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit, pdf: wp.float32, u: wp.vec2
+) -> KnownRadiance:
     at = surface_slots(data.rows, scene, s, hit.face, hit.u, hit.v)
     known = KnownRadiance()
     if is_kept(at):

@@ -59,6 +59,7 @@ from warp_gi.techniques.reuse.guided_paths import GuidedPaths as GuidedPaths
 from warp_gi.techniques.reuse.light_cache import VisibilityLightCache as VisibilityLightCache
 from warp_gi.techniques.reuse.pictures import reuse_pictures as reuse_pictures
 from warp_gi.techniques.reuse.sample_octree import SampleOctree as SampleOctree
+from warp_gi.techniques.surface_cache.cache import SurfaceCache as SurfaceCache
 from warp_gi.techniques.visibility_field.estimator import VisibilityField as VisibilityField
 
 __version__: str

@@ -110,7 +110,15 @@ class PathRequest:
         self.sky = SamplerInUse(sky, data)
 
     def use_cache(self, cache: path_samplers.PathCache, data: Any, vertex: int = int(path_trace.CACHE_VERTEX)) -> None:
-        """Let paths end in a radiance cache from a vertex on; ``data`` is its struct. 1 is the first hit."""
+        """Let paths end in a radiance cache from a vertex on; ``data`` is its struct. 1 is the first hit.
+
+        Raises OptionError for the first hit and a cache that holds direct light, which is a term of its own there.
+        """
+        if cache.holds_direct and vertex < int(path_trace.CACHE_VERTEX):
+            raise OptionError(
+                f"the radiance cache {cache.name!r} holds direct light and is read from vertex "
+                f"{int(path_trace.CACHE_VERTEX)} on, got {vertex}"
+            )
         self.cache, self.cache_vertex = SamplerInUse(cache, data), vertex
 
     def want(self, term: str, max_depth: int | None = None, roulette_depth: int = 5, clamp: float = 0.0) -> None:

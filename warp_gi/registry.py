@@ -125,9 +125,9 @@ def find(name: str) -> Any:
 
 
 def claims() -> Iterator[tuple[str, str, Claim]]:
-    """Yield class name, variant and claim of every estimator."""
+    """Yield class name, variant and claim of every estimator, and of every radiance cache that is none."""
     for one in techniques().values():
-        for name, entry in one.estimators.items():
+        for name, entry in {**one.estimators, **one.caches}.items():
             yield from ((name, variant, claim) for variant, claim in entry.claims.items())
 
 

@@ -69,6 +69,9 @@ def path_numbers(vertices: int = VERTICES) -> dict[tuple[str, int], str]:
         draw(RANDOM, at + d.DIRECTION_DIMENSION + d.GUIDE_DIMENSIONS, who + "leaf of a guide")
         draw(RANDOM, at + d.ROULETTE_DIMENSION, who + "roulette")
         draw(RANDOM, at + d.CACHE_DIMENSION, who + "cache")
+        draw(RANDOM, at + d.CACHE_PLACE_DIMENSION, who + "place in a cache")
+        draw(RANDOM, at + d.CACHE_PLACE_DIMENSION + 1, who + "place in a cache")
+        draw(RANDOM, at + d.CACHE_LOBE_DIMENSION, who + "lobe beside a cache")
         draw(RANDOM, at + d.EXPLORE_DIMENSION, who + "exploring")
         for first in (d.EXPLORE_POINT_DIMENSION, d.EXPLORE_POINT_DIMENSION + d.EXPLORE_DIGITS_DIMENSION):
             draw(RANDOM, at + first, who + "exploring")

@@ -257,7 +257,9 @@ class SteadyCache:
 
 
 @wp.func
-def steady_lookup(data: SteadyCache, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit) -> KnownRadiance:
+def steady_lookup(
+    data: SteadyCache, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit, pdf: wp.float32, u: wp.vec2
+) -> KnownRadiance:
     if data.colored != 0:
         return KnownRadiance(wp.cw_mul(data.radiance, s.base_color), data.validity)
     return KnownRadiance(data.radiance, data.validity)
@@ -369,6 +371,53 @@ def test_a_cache_is_asked_about_a_surface_with_its_colour():
 def test_clamp_holds_for_cached_light():
     picture = cached(furnace(0.5), camera_inside(), 100.0, spp=1, clamp=0.25)
     np.testing.assert_allclose(picture["indirect"].max(axis=-1), 0.25, rtol=1e-6)
+
+
+@wp.func
+def half_lobe(data: SteadyCache, s: Surface, wo: wp.vec3) -> wp.float32:
+    return 0.5
+
+
+WHOLE = path_tracer(
+    *(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY),
+    PathCache("whole", SteadyCache, steady_lookup, holds_direct=True),
+)
+LOBES = path_tracer(
+    *(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY),
+    PathCache("lobes", SteadyCache, steady_lookup, holds_direct=True, lobe=half_lobe),
+)
+
+
+def test_a_cache_that_holds_direct_light_ends_paths_without_samples():
+    """Nothing but what is known arrives from the second vertex: in a furnace, albedo times that."""
+
+    def fill(samplers: Any, items: int) -> None:
+        samplers.cache.radiance, samplers.cache.validity = wp.vec3(3.0, 2.0, 1.0), 1.0
+
+    found = trace(furnace(0.6), camera_inside(), WHOLE, fill, spp=2)
+    np.testing.assert_allclose(found["indirect"], np.tile([1.8, 1.2, 0.6], (16, 16, 1)), rtol=1e-5)
+    assert found["emitters"].mean() == pytest.approx(0.6, rel=0.03)
+
+
+def test_a_lobe_that_a_cache_does_not_know_is_traced():
+    """Where a metal is all lobe, and the cache knows none of it, paths that go on half the time bring all its light."""
+
+    def fill(samplers: Any, items: int) -> None:
+        samplers.cache.validity = 1.0
+
+    scene, camera = lit_court()
+    for node in scene.nodes:
+        for mesh in node.meshes:
+            mesh.material.metallic, mesh.material.specular, mesh.material.roughness = 1.0, 1.0, 0.5
+    scene = gi.Scene(scene.nodes, environment=low_sky())
+    known, found = (
+        np.stack([trace(scene, camera, tracer, make, spp=16, seed=seed)["indirect"] for seed in range(16)])
+        for tracer, make in ((REFERENCE, None), (LOBES, fill))
+    )
+    expected, variance = st.mean_and_variance(known.mean(axis=(1, 2)))
+    mean, noise = st.mean_and_variance(found.mean(axis=(1, 2)))
+    assert (expected > 0.01).all() and (np.abs(mean - expected) < 4 * np.sqrt(variance + noise)).all()
+    assert (np.sqrt(variance + noise) < 0.05 * expected).all()
 
 
 # ---- what learners get of paths that end in a cache ----

@@ -59,6 +59,9 @@ def preset(name, **settings):
         pipeline = replace(pipeline, environment=FIELD)
     if isinstance(pipeline.indirect, gi.LightFieldProbes):
         pipeline = replace(pipeline, indirect=replace(PROBES, primary=pipeline.indirect.primary))
+    if pipeline.indirect is not None and pipeline.indirect.radiance_cache is not None:
+        ends_in = replace(pipeline.indirect.radiance_cache, paths=2000)
+        pipeline = replace(pipeline, indirect=replace(pipeline.indirect, ends_in=ends_in))
     for term in ("environment", "indirect"):
         if isinstance(getattr(pipeline, term), gi.RadianceTransfer):
             pipeline = replace(pipeline, **{term: replace(getattr(pipeline, term), resolution=64, rays=128)})
@@ -149,6 +152,8 @@ CASES = {
     "probes moving": Case("unsaved", preset("probes"), moving=True),
     "probes turning": Case("unsaved", preset("probes"), turning=True),
     "probes fixed": Case("", preset("probes", indirect=replace(PROBES, update=0)), moving=True),
+    "cache": Case("", preset("cache")),
+    "cache turning": Case("", preset("cache"), turning=True),
     "transfer": Case("", preset("transfer")),
     "transfer turning": Case("", preset("transfer"), turning=True),
     "transfer moving": Case("", replace(preset("transfer"), indirect=None), moving=True),

@@ -25,11 +25,11 @@ from warp_gi.cli.inputs import (
 from warp_gi.cli.options import flag, parse_options, value_given
 from warp_gi.cli.report import Reporter, run_command
 from warp_gi.errors import OptionError
-from warp_gi.estimator import Estimator
 from warp_gi.files import check_writable, remove_stale_parts
 from warp_gi.rendering import bake
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.scene import Scene
+from warp_gi.stateful import Stateful
 from warp_gi.techniques.bake_tool import BakeTool
 
 BAKEABLE = registry.bakeable()
@@ -75,7 +75,7 @@ class BakeOptions(SceneOptions):
     """Page, .html, that shows the bake in a browser and needs no network, where a technique has one; see above."""
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print nothing but errors."""
-    settings: Annotated[Estimator, tyro.conf.arg(name="")] = field(
+    settings: Annotated[Stateful, tyro.conf.arg(name="")] = field(
         default_factory=lambda: tool_of(DEFAULT_TECHNIQUE).settings()
     )
 

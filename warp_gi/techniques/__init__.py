@@ -7,4 +7,5 @@ TECHNIQUES = (
     "light_field",
     "reuse",
     "radiance_transfer",
+    "surface_cache",
 )

@@ -9,15 +9,15 @@ from typing import ClassVar, Generic, NamedTuple, TypeVar
 
 from warp_gi.baking import Bake
 from warp_gi.errors import OptionError
-from warp_gi.estimator import Estimator
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.scene import Scene
+from warp_gi.stateful import Stateful
 
 Value = str | int | float
 Rows = list[tuple[str, Value]]
 """Rows of a table of two columns: what a value is, with its unit, and the value."""
 
-Settings = TypeVar("Settings", bound=Estimator)
+Settings = TypeVar("Settings", bound=Stateful)
 
 
 class Table(NamedTuple):
@@ -38,7 +38,7 @@ class BakeTool(ABC, Generic[Settings]):
     """
 
     settings: type[Settings]
-    """Class of the estimator that is baked; its fields are the flags."""
+    """Class of the estimator or radiance cache that is baked; its fields are the flags."""
     summary: ClassVar[Sequence[str]]
     """Lines of the command's help that say what is baked."""
     shows: ClassVar[Sequence[str]]

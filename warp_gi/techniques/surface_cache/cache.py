@@ -1,0 +1,198 @@
+"""The radiance cache of surface cells: settings, bake and state."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from warp_gi import launch
+from warp_gi.baking import Bake
+from warp_gi.errors import BakeError, OptionError, SceneError, check_whole
+from warp_gi.kernels.surface_cache import SURFACE_CACHE, SurfaceCells
+from warp_gi.radiance_cache import RadianceCache
+from warp_gi.scene.baked import whole_scene
+from warp_gi.stateful import Ahead
+from warp_gi.techniques.light_field.places import camera_rows, cameras_of
+from warp_gi.techniques.surface_cache.cells import with_table
+from warp_gi.techniques.surface_cache.fill import FillSettings, fill, grid_at
+
+if TYPE_CHECKING:
+    from warp_gi.baking import Setting
+    from warp_gi.frame import Frame
+    from warp_gi.scene.baked import BakedScene
+    from warp_gi.scene.camera import Camera, CameraPath
+    from warp_gi.scene.scene import Scene
+
+SAME_VIEW = 1e-4
+"""Largest relative difference between a number of a camera and that of a bake's camera for the two to be the same."""
+
+
+@dataclass(frozen=True)
+class SurfaceCache(RadianceCache):
+    """Radiance cache of surface cells in a hash grid, which the camera's own paths fill before the first frame.
+
+    A cell knows all light that arrives at the surfaces in it, so a path that ends there needs no shadow ray. Where
+    nothing is known a path goes on. Biased: light is averaged over a cell. It is for scenes in which nothing moves.
+    """
+
+    paths: int = 150_000
+    """Number of paths that fill the cells, from pixels of all frames of the camera's path. More paths lower the error
+    that more samples a pixel do not."""
+    vertices: int = 8
+    """Vertices of such a path; behind its last one the light comes from the cells."""
+    cell: float = 0.0
+    """Side in metres of a cell near the camera; 0 is a hundredth of the scene's diagonal, but at most 0.15 m. Light
+    leaks through walls that are much thinner."""
+    growth: float = 0.015
+    """Side of a cell over its distance from the camera's path, where that is more than ``cell``."""
+    capacity: int = 1 << 19
+    """Largest number of cells, of 80 bytes each with the empty places of the table. Those with the fewest samples find
+    no place, and a warning tells of them."""
+
+    traced_below: float = 0.2
+    """Roughness below which the specular lobe of a surface where a path ends is traced by one more ray, not read."""
+
+    def validate(self) -> None:
+        """Raise OptionError for settings out of range."""
+        check_whole("paths", self.paths, 1, 1 << 30)
+        check_whole("vertices", self.vertices, 1, 64)
+        check_whole("capacity", self.capacity, 1, 1 << 26)
+        for name in ("cell", "growth"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise OptionError(f"{name} must be finite and not negative, got {value}")
+
+        if not 0 <= self.traced_below <= 1:
+            raise OptionError(f"traced_below must be a roughness from 0 to 1, got {self.traced_below}")
+
+    @property
+    def fill_settings(self) -> FillSettings:
+        """The settings that decide the cells."""
+        return FillSettings(**{one.name: getattr(self, one.name) for one in fields(FillSettings)})
+
+    # ---- bake ----
+
+    def bake_key(self, scene: Scene | BakedScene) -> str:
+        """Return the hash of all of the scene, its sky too."""
+        return scene.hash
+
+    def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Setting]:
+        """Return the settings that a bake depends on."""
+        return self.fill_settings.stored()
+
+    def bake(
+        self,
+        scene: Scene,
+        device: str,
+        seed: int = 0,
+        progress: Callable[[float], None] | None = None,
+        camera: Camera | CameraPath | None = None,
+    ) -> Bake:
+        """Return the cells that paths from every frame of ``camera`` fill; the scene's own cameras stand for None.
+
+        Raises OptionError without a camera, SceneError for a scene or a sky that moves.
+        """
+        check_still(scene)
+        cameras = cameras_of(camera, every=True) or list(scene.cameras.values())
+        if not cameras:
+            raise OptionError(
+                "a surface cache is filled from where the scene is seen, and no camera is known: give a camera"
+            )
+        settings = self.fill_settings
+        filled = fill(scene, settings, cameras, launch.get_device(device), seed, progress)
+        if filled.over:
+            warnings.warn(
+                f"the surface cache is full: it keeps {self.capacity:,} cells, and {filled.over:,} with fewer samples "
+                "found no place; paths go on there, which costs time: raise capacity, cell or growth",
+                stacklevel=2,
+            )
+        grid, cells = filled.grid, filled.cells
+        arrays = {
+            "keys": cells.keys,
+            "cells": cells.means(),
+            "low": np.array(grid.low, np.float32),
+            "side": np.array([grid.side], np.float32),
+            "boxes": filled.boxes,
+            "cameras": camera_rows(cameras),
+        }
+        counts: dict[str, int | float] = {
+            "cells": len(cells.keys),
+            "cells_over": filled.over,
+            "vertices": filled.vertices,
+            "samples": int(cells.counts.sum()),
+        }
+        return Bake("SurfaceCache", self.bake_key(scene), settings.stored(), arrays, counts, scene.name)
+
+    def check_view(self, bake: Bake, camera: Camera | CameraPath) -> None:
+        """Warn if a bake was made for another camera path: where it has no cells, paths go on."""
+        made_for, wanted = bake.arrays["cameras"], camera_rows(cameras_of(camera))
+        largest = SAME_VIEW * np.maximum(np.abs(wanted).max(axis=1, keepdims=True), 1)
+        known = np.abs(wanted[:, None] - made_for).max(axis=2) <= largest
+        if not known.any(axis=1).all():
+            warnings.warn(
+                "this bake of a surface cache is of another camera path: where it has no cells, paths go on, with "
+                "noise: bake for this camera",
+                stacklevel=2,
+            )
+
+    def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> SurfaceCells:
+        """Return the cells on the device.
+
+        Raises SceneError for a scene that moves, BakeError for arrays that do not fit together.
+        """
+        check_still(whole_scene(scene))
+        bake = bake or self.bake(whole_scene(scene), device, seed)
+        target, arrays = launch.get_device(device), bake.arrays
+        if not _is_whole(arrays):
+            raise BakeError(
+                f"this bake of {bake.scene_name!r} does not hold a surface cache that fits together: bake again"
+            )
+        grid: SurfaceCells = grid_at(arrays["low"], float(arrays["side"][0]), self.growth, arrays["boxes"], target)
+        grid.traced_below = self.traced_below
+        return with_table(grid, arrays["keys"], arrays["cells"], target)
+
+    # ---- frames ----
+
+    def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
+        """Return False: the bake is all that is kept."""
+        return False
+
+    def give(self, frame: Frame, state: SurfaceCells) -> None:
+        """Let paths end in the cells."""
+        frame.paths.use_cache(SURFACE_CACHE, state)
+
+
+def check_still(scene: Scene) -> None:
+    """Raise SceneError for a scene in which something moves, or whose sky does."""
+    moving = [node.name for index, node in enumerate(scene.nodes) if scene.moves(index)]
+    if moving or scene.is_sky_animated:
+        what = f"{moving[0]!r} moves" if moving else "the sky changes over time"
+        raise SceneError(
+            f"a surface cache holds the light of a scene at rest, and here {what}; "
+            "take indirect=BsdfPaths() without ends_in"
+        )
+
+
+def _is_whole(arrays: dict[str, np.ndarray]) -> bool:
+    """Return whether arrays have their shapes and types, and keys are in order."""
+    count = len(arrays.get("keys", ()))
+    wanted = {
+        "keys": (np.uint64, (count,)),
+        "cells": (np.float32, (count, 8)),
+        "low": (np.float32, (3,)),
+        "side": (np.float32, (1,)),
+        "boxes": (np.float32, (len(arrays.get("boxes", ())), 2, 3)),
+    }
+    has_shape = all(
+        name in arrays and arrays[name].dtype == dtype and arrays[name].shape == shape
+        for name, (dtype, shape) in wanted.items()
+    )
+    if not has_shape or not len(arrays["boxes"]) or not arrays["side"][0] > 0:
+        return False
+    keys = arrays["keys"]
+    return bool((keys[:1] > 0).all() and (keys[1:] > keys[:-1]).all())

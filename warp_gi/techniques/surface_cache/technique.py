@@ -1,0 +1,13 @@
+"""A radiance cache on surfaces: paths end in cells of a hash grid that were filled before the first frame."""
+
+from warp_gi.registry import Claim, Entry, Technique
+
+TECHNIQUE = Technique(
+    name="surface-cache",
+    short="cache",
+    caches={"SurfaceCache": Entry("cache", {"": Claim(unbiased=False, bound=0.03)})},
+    presets={"cache": {"indirect": ("BsdfPaths", {"ends_in": "SurfaceCache"})}},
+    samplers=("surface_cache.SURFACE_CACHE",),
+    bake_tool="bake_tool",
+    page="techniques/surface_cache.md",
+)
