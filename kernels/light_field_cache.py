@@ -90,7 +90,7 @@ def probe_lookup(
     data: ProbeCache, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit, pdf: wp.float32, u: wp.vec2
 ) -> KnownRadiance:
     seen = seen_light(scene, data.field, data.visibility, s.position, shading_normal(s), ray_origin(s))
-    return KnownRadiance(cached_radiance(s, seen), seen.trust)
+    return KnownRadiance(cached_radiance(s, seen), seen.trust, 0.0)
 
 
 PROBE_CACHE = PathCache("probes", ProbeCache, probe_lookup)

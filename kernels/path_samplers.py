@@ -120,6 +120,7 @@ class PathCache(NamedTuple):
 class KnownRadiance:
     radiance: wp.vec3  # W/(m^2 sr), reflected towards wo
     validity: wp.float32  # share of paths that end here, in [0, 1]; 0: nothing is known, 1: all of them end
+    follow: wp.float32  # of a cache that holds direct light: share of these that go on all the same, and correct it
 
 
 # A direction with its density; `weight` is f cos / pdf but for the colour of a Lambert surface, see sample_weight.

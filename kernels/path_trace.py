@@ -186,6 +186,7 @@ def _made(
         reflected = wp.vec3(1.0, 1.0, 1.0)
         samples_sky = sky.is_sampled(samplers.sky, scene)
         sharpness = float(wp.inf)
+        corrects = bool(False)
         for depth in range(2, paths.max_depth + 1):
             at_first = depth == 2
             d = PATH_DIMENSION + (depth - 2) * VERTEX_DIMENSIONS
@@ -195,14 +196,15 @@ def _made(
             if at >= 0:
                 regions.begin(samplers.regions, at, s)
             # All but the direct light may be known here; then the path ends, whatever edges it has left. Where direct
-            # light is known as well the path ends without samples of lights, or goes on by a lobe alone. Learners get
+            # light is known as well the path ends without samples of lights, or goes on by a lobe alone, or goes on to
+            # correct what is known: K + (Y - K) / q for a share q of paths, else K, has the mean of Y. Learners get
             # the vertex and its light samples as ever. Of its direction they get none, not even of one that leaves for
             # the sky: nobody knows how much of what is known came from there, and skies alone would seem to be all.
             # The vertices before it learn what is known here as light that came their way, as `end` tells them all
             # that came after their own direction.
             ends = bool(False)
             if has_cache:
-                if depth > paths.cache_vertex and (not at_first or (paths.terms & TERM_INDIRECT) != 0):
+                if not corrects and depth > paths.cache_vertex and (not at_first or (paths.terms & TERM_INDIRECT) != 0):
                     s = with_color(scene, s)
                     u_first = random_1d(index, seed, d + CACHE_PLACE_DIMENSION)
                     u_place = wp.vec2(u_first, random_1d(index, seed, d + CACHE_PLACE_DIMENSION + 1))
@@ -214,14 +216,20 @@ def _made(
                         r.indirect = r.indirect + wp.cw_mul(throughput, known.radiance)
                     if holds_direct:
                         if ends:
-                            lobe = lobe_probability(samplers.cache, s, wo)
-                            if random_1d(index, seed, d + CACHE_LOBE_DIMENSION) >= lobe:
+                            goes = lobe_probability(samplers.cache, s, wo)
+                            corrects = known.follow > 0.0
+                            if corrects:
+                                goes = wp.max(goes, known.follow)
+                            if random_1d(index, seed, d + CACHE_LOBE_DIMENSION) >= goes:
                                 vertices += 1
                                 break
                             ends = False
-                            throughput = throughput / lobe
-                            reflected = reflected / lobe
-                            s.bsdf.diffuse = wp.vec3(0.0, 0.0, 0.0)
+                            throughput = throughput / goes
+                            reflected = reflected / goes
+                            if corrects:
+                                r.indirect = r.indirect - wp.cw_mul(throughput, known.radiance)
+                            else:
+                                s.bsdf.diffuse = wp.vec3(0.0, 0.0, 0.0)
             # which lights to sample: both at the first vertex, where they are two terms; else one of them
             sky_share = paths.sky_probability
             emitter_share = 1.0 - sky_share

@@ -33,6 +33,7 @@ class SurfaceCells:
     side: wp.float32  # of a cell of level 0, metres
     growth: wp.float32  # largest side of a cell over its distance from the camera's path, above level 0
     traced_below: wp.float32  # roughness below which the GGX lobe is traced, and not read
+    residual: wp.float32  # share of paths that go on and correct what cells say
     boxes: wp.array(dtype=wp.vec3)  # [2 * box] low and high corners around pieces of the camera's path, metres
     bits: wp.int32  # the table has 2^bits slots, and a few more
     keys: wp.array(dtype=wp.uint64)  # [slot]; 0: empty
@@ -187,6 +188,7 @@ def surface_lookup(
         reads_lobe = wp.where(surface_lobe(cells, s, wo) > 0.0, 0, 1)
         known.radiance = cell_exitance(cells, slot, s.bsdf, reads_lobe) / wp.pi
         known.validity = 1.0
+        known.follow = cells.residual
     return known
 
 

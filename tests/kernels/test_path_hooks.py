@@ -261,8 +261,8 @@ def steady_lookup(
     data: SteadyCache, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit, pdf: wp.float32, u: wp.vec2
 ) -> KnownRadiance:
     if data.colored != 0:
-        return KnownRadiance(wp.cw_mul(data.radiance, s.base_color), data.validity)
-    return KnownRadiance(data.radiance, data.validity)
+        return KnownRadiance(wp.cw_mul(data.radiance, s.base_color), data.validity, 0.0)
+    return KnownRadiance(data.radiance, data.validity, 0.0)
 
 
 STEADY_CACHE = PathCache("steady", SteadyCache, steady_lookup)

@@ -56,6 +56,9 @@ class SurfaceCache(RadianceCache):
 
     traced_below: float = 0.2
     """Roughness below which the specular lobe of a surface where a path ends is traced by one more ray, not read."""
+    residual: float = 0.0
+    """Share of paths that go on where others end, and correct what cells say: with any share above 0 pictures are
+    unbiased, with more noise the smaller it is. 0 corrects nothing."""
 
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
@@ -69,6 +72,8 @@ class SurfaceCache(RadianceCache):
 
         if not 0 <= self.traced_below <= 1:
             raise OptionError(f"traced_below must be a roughness from 0 to 1, got {self.traced_below}")
+        if not (self.residual == 0 or 0.01 <= self.residual <= 1):
+            raise OptionError(f"residual must be 0 or a share from 0.01 to 1, got {self.residual}")
 
     @property
     def fill_settings(self) -> FillSettings:
@@ -153,7 +158,7 @@ class SurfaceCache(RadianceCache):
                 f"this bake of {bake.scene_name!r} does not hold a surface cache that fits together: bake again"
             )
         grid: SurfaceCells = grid_at(arrays["low"], float(arrays["side"][0]), self.growth, arrays["boxes"], target)
-        grid.traced_below = self.traced_below
+        grid.traced_below, grid.residual = self.traced_below, self.residual
         return with_table(grid, arrays["keys"], arrays["cells"], target)
 
     # ---- frames ----

@@ -5,7 +5,9 @@ from warp_gi.registry import Claim, Entry, Technique
 TECHNIQUE = Technique(
     name="surface-cache",
     short="cache",
-    caches={"SurfaceCache": Entry("cache", {"": Claim(unbiased=False, bound=0.03)})},
+    caches={
+        "SurfaceCache": Entry("cache", {"": Claim(unbiased=False, bound=0.03), "residual": Claim({"residual": 0.3})})
+    },
     presets={"cache": {"indirect": ("BsdfPaths", {"ends_in": "SurfaceCache"})}},
     samplers=("surface_cache.SURFACE_CACHE",),
     bake_tool="bake_tool",
