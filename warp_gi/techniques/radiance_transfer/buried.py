@@ -11,7 +11,7 @@ from warp_gi.kernels.transfer_bake import BLACK
 from warp_gi.techniques.radiance_transfer.rays import TracedTransfer
 from warp_gi.techniques.radiance_transfer.textures import Atlas
 
-MARGIN = 0.1
+MARGIN = 0.02
 """Texels by which a slot keeps away from the edges of its face."""
 MOST_MARGIN = 0.3
 """Largest barycentric coordinate that this may take, in faces smaller than a texel."""
