@@ -201,6 +201,25 @@ def trace_transfer(
         results.transfer[slot, k] = wp.float16(exact[k])
 
 
+# Thread: a pair of slots. Tells whether a surface lies between them, a little above their own.
+@wp.kernel
+def part_slots(
+    first: wp.int32,
+    scene: SceneData,
+    slots: TransferSlots,
+    ones: wp.array(dtype=wp.int32),
+    others: wp.array(dtype=wp.int32),
+    parted: wp.array(dtype=wp.uint8),
+):
+    pair = first + wp.tid()
+    begin = ray_origin(slot_surface(scene, slots, ones[pair]))
+    way = ray_origin(slot_surface(scene, slots, others[pair])) - begin
+    length = wp.length(way)
+    parted[pair] = wp.uint8(0)
+    if length > 0.0 and bvh_occluded(scene.bvh, begin, way / length, length * SHADOW_END) != 0:
+        parted[pair] = wp.uint8(1)
+
+
 # How lamps are sampled at a slot.
 @wp.struct
 class LampSamples:

@@ -550,3 +550,11 @@ def test_unequal_settings_of_a_shared_bake_name_both_terms(capfd, tmp_path):
     error = capfd.readouterr().err
     assert error.count("\n") == 1 and "resolution 32 for indirect and 64 for environment: make them equal" in error
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_shared_setting_that_does_not_fit_the_other_term_says_so(capfd, tmp_path):
+    arguments = ["render", "cornell_box", "--pipeline=transfer", "--environment.bounces=0", "--frames=0"]
+    assert cli.main([*arguments, "-o", str(tmp_path / "a.exr")]) == 2
+    error = capfd.readouterr().err
+    assert error.count("\n") == 1 and "given for one term hold for indirect, too" in error and "indirect=none" in error
+    assert list(tmp_path.iterdir()) == []

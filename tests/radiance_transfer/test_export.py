@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -504,6 +505,18 @@ def test_no_file_of_another_is_overwritten(tmp_path):
     with pytest.raises(gi.OptionError, match=r"hall\.glb exists and is not of an earlier export"):
         export.check_export_name(tmp_path / "hall.exr")
     export.check_export_name(tmp_path / "other.exr")
+
+
+@pytest.mark.parametrize(("generator", "told"), [(export.GENERATOR, ""), ("another", "is not of an earlier export")])
+def test_a_glb_of_many_parts_says_at_its_end_by_whom_it_is(tmp_path, generator, told):
+    """Who made it stands behind all accessors, of which there may be more than any fixed number of bytes."""
+    text = json.dumps({"accessors": [{"name": "x" * 50}] * 5000, "asset": {"generator": generator}}).encode()
+    chunk = len(text).to_bytes(4, "little") + b"JSON" + text
+    (tmp_path / "hall.glb").write_bytes(
+        b"glTF" + (2).to_bytes(4, "little") + (12 + len(chunk)).to_bytes(4, "little") + chunk
+    )
+    with pytest.raises(OptionError, match=told) if told else nullcontext():
+        export.check_export_name(tmp_path / "hall.exr")
 
 
 @pytest.mark.parametrize("end", ["exr", "rgba.exr", "glb", "json"])

@@ -52,9 +52,16 @@ def with_settings_shared(pipeline: Pipeline, arguments: Sequence[str]) -> Pipeli
             if others and not _is_given(term, name, given):
                 source = next((other for other in others if _is_given(other, name, given)), term)
                 changed.setdefault(term, {})[name] = getattr(getattr(pipeline, source), name)
-    return replace(
-        pipeline, **{term: replace(getattr(pipeline, term), **settings) for term, settings in changed.items()}
-    )
+    shared: dict[str, Any] = {}
+    for term, settings in changed.items():
+        try:
+            shared[term] = replace(getattr(pipeline, term), **settings)
+        except OptionError as error:
+            raise OptionError(
+                f"settings that are given for one term hold for {term}, too, which is of the same class: {error}; "
+                f"give --{term}.NAME as well, or leave the term out by --pipeline ...,{term}=none"
+            ) from None
+    return replace(pipeline, **shared)
 
 
 def _is_given(term: str, name: str, given: Sequence[str]) -> bool:

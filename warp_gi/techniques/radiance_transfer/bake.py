@@ -129,7 +129,7 @@ def bake_transfer(
         with stages.run("rays") as told:
             work = transfer_work(scene, atlas, settings, target, seed)
             lamps = _lamps(work, scene, seed)
-            traced = without_buried(atlas, trace_slots(work, told))
+            traced = without_buried(work, atlas, trace_slots(work, told))
         stages.counts |= {"slots": atlas.count, "rays": int(traced.rays.sum(dtype=np.int64))}
         bake = _bounced(scene, work, atlas, traced, lamps, settings, stages)
     if keep_hits:

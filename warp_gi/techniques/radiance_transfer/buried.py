@@ -6,9 +6,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import warp as wp
 
-from warp_gi.kernels.transfer_bake import BLACK
-from warp_gi.techniques.radiance_transfer.rays import TracedTransfer
+from warp_gi import launch
+from warp_gi.kernels.transfer_bake import BLACK, part_slots
+from warp_gi.techniques.radiance_transfer.rays import TracedTransfer, TransferWork
 from warp_gi.techniques.radiance_transfer.textures import Atlas
 
 MARGIN = 0.02
@@ -18,8 +20,9 @@ MOST_MARGIN = 0.3
 BEHIND, CLEAR = 0.2, 0.1
 """Share of a slot's rays that meet backs, above which the slot may lie inside an object or behind a surface that cuts
 its own, and share up to which another stands in for it."""
-REACH = 3
-"""Texels from a slot in which another stands in for it: bilinear fetches of visible points read the first."""
+REACH_INSIDE, REACH_BEHIND = 3, 1
+"""Texels from a slot in which another stands in for it: inside closed objects, which nobody sees, and behind surfaces
+that are open on both sides. Bilinear fetches of points in front read the first."""
 
 
 def off_edges(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -36,41 +39,56 @@ def off_edges(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     return (weights / weights.sum(axis=1, keepdims=True))[:, 1:].astype(np.float32)
 
 
-def without_buried(atlas: Atlas, traced: TracedTransfer) -> TracedTransfer:
+def without_buried(work: TransferWork, atlas: Atlas, traced: TracedTransfer) -> TracedTransfer:
     """Return what was traced, with that of slots nearby in place of that of slots inside objects or behind surfaces.
 
     A floor's texels below a box are black, and bilinear fetches beside the box read them. The texels of a post below
-    a floor see the sky from there, which nobody above does. Rays of both meet backs. Slots whose neighbours see as
-    many, as below a sheet of cloth, stay as they are. Hits of slots that were replaced count as hits of those that
-    stand in for them.
+    a floor see the sky from there, which nobody above does. Rays of both meet backs, and a surface parts both from
+    their neighbours outside: no surface parts the floor below a sheet of cloth from the floor beside it, so that stays
+    as it is. Hits of slots that were replaced count as hits of those that stand in for them.
     """
     if atlas.corners.shape[0] == 0 or traced.hits.shape[1] == 0:
         return traced
-    backs = back_shares(atlas, traced.hits)
-    stands_in = _stand_ins(atlas, backs > BEHIND, backs <= CLEAR)
-    if np.array_equal(stands_in, np.arange(atlas.count)):
+    inside, backs = back_shares(atlas, traced.hits)
+    stands_in = _stand_ins(atlas, inside > BEHIND, backs <= CLEAR, REACH_INSIDE)
+    behind = (backs > BEHIND) & (inside <= BEHIND)
+    stands_in = np.where(behind, _stand_ins(atlas, behind, backs <= CLEAR, REACH_BEHIND), stands_in)
+    replaced = np.flatnonzero(stands_in != np.arange(atlas.count)).astype(np.int32)
+    whole = replaced[~_are_parted(work, replaced, stands_in[replaced])]
+    stands_in[whole] = whole
+    if len(whole) == len(replaced):
         return traced
     hits = traced.hits[stands_in]
     hits = np.where(hits >= 0, stands_in[np.maximum(hits, 0)], hits)
     return replace(traced, transfer=traced.transfer[stands_in], hits=hits)
 
 
-def back_shares(atlas: Atlas, hits: np.ndarray) -> np.ndarray:
-    """Return the share of each slot's rays that meet the back of a surface, float32 [slots].
+def back_shares(atlas: Atlas, hits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the shares of each slot's rays that meet what keeps nothing, and that or a back, float32 [slots] each.
 
-    Where nothing is kept counts as a back: those of closed objects keep nothing.
+    The backs of closed objects keep nothing.
     """
-    count = np.zeros(len(hits), np.int32)
+    inside, backs = (np.zeros(len(hits), np.int32) for _ in range(2))
     for ray in range(hits.shape[1]):
         hit = hits[:, ray]
-        count += (hit == BLACK) | ((hit >= 0) & (atlas.slot_sides[np.maximum(hit, 0)] == 1))
-    return (count / max(hits.shape[1], 1)).astype(np.float32)
+        inside += hit == BLACK
+        backs += (hit >= 0) & (atlas.slot_sides[np.maximum(hit, 0)] == 1)
+    rays = np.float32(max(hits.shape[1], 1))
+    return inside / rays, (inside + backs) / rays
 
 
-def _stand_ins(atlas: Atlas, wanted: np.ndarray, offered: np.ndarray) -> np.ndarray:
+def _are_parted(work: TransferWork, ones: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return whether a surface lies between the slots of each pair, bool [pairs]."""
+    parted = wp.zeros(len(ones), dtype=wp.uint8, device=work.device)
+    pairs = [launch.on_device(slots, wp.int32, work.device) for slots in (ones, others)]
+    launch.launch(part_slots, len(ones), [work.data, work.slots, *pairs, parted], work.device)
+    return np.asarray(parted.numpy() > 0)
+
+
+def _stand_ins(atlas: Atlas, wanted: np.ndarray, offered: np.ndarray, reach: int) -> np.ndarray:
     """Return for each slot itself or, if it is ``wanted``, the nearest of its chart that is ``offered``, int32 [slots].
 
-    A slot that is wanted and finds none within `REACH` texels stays itself.
+    A slot that is wanted and finds none within ``reach`` texels stays itself.
     """
     result = np.where(offered, np.arange(atlas.count), -1).astype(np.int32)
     result[wanted] = -1
@@ -82,7 +100,7 @@ def _stand_ins(atlas: Atlas, wanted: np.ndarray, offered: np.ndarray) -> np.ndar
             grid[1:-1, 1:-1] = atlas.slots[side, start : start + width * height].reshape(height, width)
             rows, columns = np.nonzero((grid >= 0) & wanted[np.maximum(grid, 0)])
             slots = grid[rows, columns]
-            for _ in range(REACH):
+            for _ in range(reach):
                 found = np.full(len(slots), -1, np.int32)
                 for i, j in steps:
                     near = grid[rows + i, columns + j]

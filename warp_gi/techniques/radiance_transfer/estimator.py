@@ -200,6 +200,7 @@ class RadianceTransfer(Estimator, RadianceCache):
         """Add the light of the current camera sample, of all terms with these settings at once."""
         own = {term: one for term, one in frame.estimators.items() if isinstance(one, RadianceTransfer)}
         mine = [term for term, one in own.items() if replace(one, term=self.term) == self]
+        mine = mine or [self.term]  # a frame that no scheduler made, or an estimator within another
         if mine[0] != self.term:
             return  # the first of them did it
         query, buffers = transfer_shade.TransferQuery(), transfer_shade.TransferBuffers()

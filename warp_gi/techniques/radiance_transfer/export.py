@@ -143,8 +143,10 @@ def _is_exported(file: Path) -> bool:
             return bool(json.loads(file.read_text())["format"] == FORMAT)
         with open(file, "rb") as opened:
             head = opened.read(HEAD)
-        if file.suffix == ".glb":
-            return GENERATOR.encode() in head
+            if file.suffix == ".glb":  # 12 bytes of header, then the length of the JSON chunk, its type and itself
+                opened.seek(20)
+                said = json.loads(opened.read(int.from_bytes(head[12:16], "little")))
+                return bool(said["asset"]["generator"] == GENERATOR)
         return DIGEST.encode() in head
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return False
