@@ -151,6 +151,13 @@ def known_slot(cells: SurfaceCells, s: Surface, level: wp.int32, levels: wp.int3
     return slot
 
 
+# Side in metres of the cell in a slot.
+@wp.func
+def side_in_slot(cells: SurfaceCells, slot: wp.int32) -> wp.float32:
+    level = wp.int32(cells.keys[slot] & wp.uint64(15)) - 1
+    return cells.side * wp.float32(1 << level)
+
+
 # Exitance [W/m^2] of a cell at a point with this material; `with_lobe` 0 leaves the GGX lobe out.
 @wp.func
 def cell_exitance(cells: SurfaceCells, slot: wp.int32, b: Bsdf, with_lobe: wp.int32) -> wp.vec3:
@@ -179,12 +186,11 @@ def surface_lookup(
     cells: SurfaceCells, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit, pdf: wp.float32, u: wp.vec2
 ) -> KnownRadiance:
     known = KnownRadiance()
-    level = cell_level(cells, s.position)
-    nearest = NEAR * cells.side * wp.float32(1 << level)
-    if hit.t * hit.t < wp.max(wp.pi * pdf, 1.0) * nearest * nearest:
+    slot = known_slot(cells, s, cell_level(cells, s.position), READ_LEVELS, u)
+    if slot < 0:
         return known
-    slot = known_slot(cells, s, level, READ_LEVELS, u)
-    if slot >= 0:
+    nearest = NEAR * side_in_slot(cells, slot)
+    if hit.t * hit.t >= wp.max(wp.pi * pdf, 1.0) * nearest * nearest:
         reads_lobe = wp.where(surface_lobe(cells, s, wo) > 0.0, 0, 1)
         known.radiance = cell_exitance(cells, slot, s.bsdf, reads_lobe) / wp.pi
         known.validity = 1.0
