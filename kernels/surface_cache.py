@@ -18,7 +18,7 @@ from warp_gi.kernels.types import SceneData
 wp.set_module_options({"enable_backward": False})
 
 LEVELS = wp.constant(5)  # sizes of cells that a point lies in, each twice the one before
-READ_LEVELS = wp.constant(3)  # that paths of a picture read; the others are for the ends of paths that fill cells
+READ_LEVELS = wp.constant(2)  # that paths of a picture read: wider cells reach through walls; those are for fills
 LARGEST_LEVEL = wp.constant(10)  # of the smallest of them, so that the key has room for all
 LARGEST_COORDINATE = wp.constant((1 << 19) - 1)  # of a cell of level 0, along an axis
 NEAR = wp.constant(wp.float32(0.5))  # sides of a cell below which matt surfaces are too near to each other to read one
