@@ -57,10 +57,16 @@ def test_a_white_furnace(scale):
     assert len(sampled) > 20 and np.abs(sampled[:, :3] / (5 * np.pi) - 1).max() < 0.02
 
 
-def test_the_fewest_paths_leave_a_white_furnace_white():
-    """Also its first passes must have enough paths to fill the cells that later ones read."""
-    bake = baked(scene_of(*closed_box(0.8, 1.0)), camera_in_box(), gi.SurfaceCache(paths=1000))
-    np.testing.assert_allclose(mean_of(bake), 5 * np.pi, rtol=0.025)
+@pytest.mark.parametrize(("vertices", "low", "high"), [(8, 0.975, 1.01), (1, 0.37, 0.45)])
+def test_the_fewest_paths_leave_a_white_furnace_white(vertices, low, high):
+    """Also its first passes have enough paths to fill the cells that later ones read.
+
+    Of paths with one vertex all light but the direct one comes from there, if only of four reflections: with 30 paths a
+    pass 0.31 of it arrives, with 250 0.41.
+    """
+    bake = baked(scene_of(*closed_box(0.8, 1.0)), camera_in_box(), gi.SurfaceCache(paths=1000, vertices=vertices))
+    share = mean_of(bake) / (5 * np.pi)
+    assert (share > low).all() and (share < high).all()
 
 
 def test_a_launch_keeps_no_more_records_with_longer_paths(monkeypatch):

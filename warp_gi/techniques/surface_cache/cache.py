@@ -119,8 +119,8 @@ class SurfaceCache(RadianceCache):
         if filled.over:
             warnings.warn(
                 f"the surface cache is full: it keeps {self.capacity:,} cells, and {filled.over:,} with fewer samples "
-                "found no place; light is blurred over larger cells there, and may leak through walls: raise capacity, cell or "
-                "growth",
+                "found no place; light is blurred over larger cells there, and may leak through walls: "
+                "raise capacity, cell or growth",
                 stacklevel=2,
             )
         grid, cells = filled.grid, filled.cells
