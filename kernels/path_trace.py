@@ -200,8 +200,9 @@ def _made(
             # correct what is known: K + (Y - K) / q for a share q of paths, else K, has the mean of Y. Learners get
             # the vertex and its light samples as ever. Of its direction they get none, not even of one that leaves for
             # the sky: nobody knows how much of what is known came from there, and skies alone would seem to be all.
-            # The vertices before it learn what is known here as light that came their way, as `end` tells them all
-            # that came after their own direction.
+            # Where direct light is known they get `begin` alone, even if a lobe is traced, whose light is not all that
+            # the surface reflects; of a path that corrects what is known they get all. The vertices before it learn
+            # what is known here as light that came their way, as `end` tells them all that came after their direction.
             ends = bool(False)
             if has_cache:
                 if not corrects and depth > paths.cache_vertex and (not at_first or (paths.terms & TERM_INDIRECT) != 0):
@@ -230,6 +231,7 @@ def _made(
                                 r.indirect = r.indirect - wp.cw_mul(throughput, known.radiance)
                             else:
                                 s.bsdf.diffuse = wp.vec3(0.0, 0.0, 0.0)
+                                at = -1
             # which lights to sample: both at the first vertex, where they are two terms; else one of them
             sky_share = paths.sky_probability
             emitter_share = 1.0 - sky_share

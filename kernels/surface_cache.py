@@ -18,7 +18,7 @@ from warp_gi.kernels.types import SceneData
 wp.set_module_options({"enable_backward": False})
 
 LEVELS = wp.constant(5)  # sizes of cells that a point lies in, each twice the one before
-READ_LEVELS = wp.constant(3)  # that paths of a picture read; the others are for the ends of paths that fill cells
+READ_LEVELS = wp.constant(2)  # that paths of a picture read: wider cells reach through walls; those are for fills
 LARGEST_LEVEL = wp.constant(10)  # of the smallest of them, so that the key has room for all
 LARGEST_COORDINATE = wp.constant((1 << 19) - 1)  # of a cell of level 0, along an axis
 NEAR = wp.constant(wp.float32(0.5))  # sides of a cell below which matt surfaces are too near to each other to read one
@@ -151,6 +151,13 @@ def known_slot(cells: SurfaceCells, s: Surface, level: wp.int32, levels: wp.int3
     return slot
 
 
+# Side in metres of the cell in a slot.
+@wp.func
+def side_in_slot(cells: SurfaceCells, slot: wp.int32) -> wp.float32:
+    level = wp.int32(cells.keys[slot] & wp.uint64(15)) - 1
+    return cells.side * wp.float32(1 << level)
+
+
 # Exitance [W/m^2] of a cell at a point with this material; `with_lobe` 0 leaves the GGX lobe out.
 @wp.func
 def cell_exitance(cells: SurfaceCells, slot: wp.int32, b: Bsdf, with_lobe: wp.int32) -> wp.vec3:
@@ -179,12 +186,11 @@ def surface_lookup(
     cells: SurfaceCells, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit, pdf: wp.float32, u: wp.vec2
 ) -> KnownRadiance:
     known = KnownRadiance()
-    level = cell_level(cells, s.position)
-    nearest = NEAR * cells.side * wp.float32(1 << level)
-    if hit.t * hit.t < wp.max(wp.pi * pdf, 1.0) * nearest * nearest:
+    slot = known_slot(cells, s, cell_level(cells, s.position), READ_LEVELS, u)
+    if slot < 0:
         return known
-    slot = known_slot(cells, s, level, READ_LEVELS, u)
-    if slot >= 0:
+    nearest = NEAR * side_in_slot(cells, slot)
+    if hit.t * hit.t >= wp.max(wp.pi * pdf, 1.0) * nearest * nearest:
         reads_lobe = wp.where(surface_lobe(cells, s, wo) > 0.0, 0, 1)
         known.radiance = cell_exitance(cells, slot, s.bsdf, reads_lobe) / wp.pi
         known.validity = 1.0

@@ -31,7 +31,7 @@ from warp_gi.kernels.path_samplers import (
     Regions,
     Sky,
 )
-from warp_gi.kernels.path_trace import NO_PATH, REFERENCE, TERM_INDIRECT, PathSettings, path_tracer
+from warp_gi.kernels.path_trace import NO_PATH, REFERENCE, TERM_INDIRECT, PathSettings, PathTracer, path_tracer
 from warp_gi.kernels.surface import Surface, surface_at
 from warp_gi.kernels.types import SceneData
 
@@ -482,15 +482,20 @@ LOG_REGIONS = Regions("log", Log, log_region, log_slot, log_at, log_begin, log_l
 LOGGED = path_tracer(
     ALIAS_LIGHTS, BSDF_DIRECTIONS, LOG_REGIONS, SCENE_SKY, PathCache("logged", SteadyCache, steady_lookup)
 )
+LOGGED_LOBES = path_tracer(
+    *(ALIAS_LIGHTS, BSDF_DIRECTIONS, LOG_REGIONS, SCENE_SKY),
+    PathCache("logged_lobes", SteadyCache, steady_lookup, holds_direct=True, lobe=half_lobe),
+)
 
 
-def test_learners_get_cached_light_as_light_of_the_way_there():
-    """No direction at the last vertex, not even one to the sky; what is known there counts for the vertex before."""
-    scene, camera = lit_court()
+def logged(
+    scene: gi.Scene, camera: gi.Camera, tracer: PathTracer, radiance: float
+) -> tuple[dict[str, np.ndarray], Any]:
+    """Return pictures of one sample with a cache that says the same everywhere, and the log of 4 vertices a path."""
     logs: list[Any] = []
 
     def fill(samplers: Any, items: int) -> None:
-        samplers.cache.radiance, samplers.cache.validity = wp.vec3(2.0, 2.0, 2.0), 1.0
+        samplers.cache.radiance, samplers.cache.validity = wp.vec3(radiance, radiance, radiance), 1.0
         log = samplers.regions
         log.vertices = 4
         for name in ("begun", "lights", "directions"):
@@ -499,8 +504,12 @@ def test_learners_get_cached_light_as_light_of_the_way_there():
         log.ends = wp.zeros(items, dtype=wp.float32, device=device())
         logs.append(log)
 
-    picture = trace(scene, camera, LOGGED, fill, spp=1)
-    log = logs[0]
+    return trace(scene, camera, tracer, fill, spp=1), logs[0]
+
+
+def test_learners_get_cached_light_as_light_of_the_way_there():
+    """No direction at the last vertex, not even one to the sky; what is known there counts for the vertex before."""
+    picture, log = logged(*lit_court(), LOGGED, 2.0)
     begun, lights, directions, before = (
         getattr(log, name).numpy().reshape(64, 4) for name in ("begun", "lights", "directions", "before")
     )
@@ -512,6 +521,17 @@ def test_learners_get_cached_light_as_light_of_the_way_there():
     gathered = (picture["environment"] + picture["indirect"]).reshape(64, 3) @ [0.2126, 0.7152, 0.0722]
     np.testing.assert_allclose(log.ends.numpy(), gathered, rtol=1e-4, atol=1e-6)
     assert (log.ends.numpy() - before[:, 0])[second].min() > 0.02
+
+
+def test_learners_get_no_light_of_a_lobe_that_is_traced_alone():
+    """It is not all that the surface reflects: such a vertex is begun, and no more, as where a path ends."""
+    _, log = logged(*lit_court(), LOGGED_LOBES, 2.0)
+    begun, lights, directions = (
+        getattr(log, name).numpy().reshape(64, 4) for name in ("begun", "lights", "directions")
+    )
+    assert begun[:, 1].mean() > 0.2 and begun[:, 2].any()
+    assert lights[:, 0].all() and directions[:, 0].any()
+    assert not lights[:, 1:].any() and not directions[:, 1:].any()
 
 
 # ---- one tracer for one combination ----

@@ -8,7 +8,11 @@ from statistics_tools import every_device  # noqa: F401
 
 from warp_gi import launch
 from warp_gi.kernels import surface_cache as kernels
-from warp_gi.techniques.surface_cache.cells import Sums, coarser, first_slots, hash_table, with_table
+from warp_gi.kernels.bsdf import lambert
+from warp_gi.kernels.bvh import BvhHit
+from warp_gi.kernels.surface import Surface
+from warp_gi.kernels.types import SceneData
+from warp_gi.techniques.surface_cache.cells import Sums, coarser, first_slots, hash_table, table_nbytes, with_table
 from warp_gi.techniques.surface_cache.fill import grid_at
 
 wp.set_module_options({"enable_backward": False})
@@ -36,6 +40,26 @@ def look_up(
     keys[i, 2] = kernels.coarser_key(keys[i, 1])
     slots[i, 0] = kernels.first_slot(keys[i, 0], 10)
     slots[i, 1] = kernels.cell_slot(cells, keys[i, 0])
+
+
+# Thread: a matt surface seen from a hit at a distance. Writes whether a cell is read there.
+@wp.kernel
+def read_from(
+    first: wp.int32,
+    cells: kernels.SurfaceCells,
+    positions: wp.array(dtype=wp.vec3),
+    distances: wp.array(dtype=wp.float32),
+    known: wp.array(dtype=wp.float32),
+):
+    i = first + wp.tid()
+    s = Surface()
+    s.position = positions[i]
+    s.normal = wp.vec3(0.0, 1.0, 0.0)
+    s.bsdf = lambert(wp.vec3(1.0, 1.0, 1.0))
+    hit = BvhHit()
+    hit.t = distances[i]
+    found = kernels.surface_lookup(cells, SceneData(), s, wp.vec3(0.0, 0.0, 1.0), hit, 1.0 / wp.pi, wp.vec2(0.5, 0.5))
+    known[i] = found.validity
 
 
 def looked_up(positions: np.ndarray, normals: np.ndarray, known: np.ndarray, rows: np.ndarray | None = None):
@@ -145,6 +169,32 @@ def test_sums_by_key_and_level():
     np.testing.assert_allclose(total.light, [sum(expected[int(key)]) for key in total.keys], rtol=1e-12)
     rest = half[0].without(half[1])
     assert set(rest.keys) == set(half[0].keys) - set(half[1].keys) and len(rest.keys)
+
+
+@pytest.mark.parametrize("above", [0, 1, 2])
+def test_cells_are_read_from_half_a_side_of_the_cell_that_is_there(above):
+    """Where only a wider cell is known, hits must be farther; a cell four times as wide is not read at all."""
+    device, random = st.device(), np.random.default_rng(3)
+    positions = random.uniform([-2, 0, -1], [3, 2, 3], (2000, 3))
+    levels = np.array([level_of(p) for p in positions])
+    side = SIDE * 2.0 ** (levels + above)
+    distances = side * random.uniform(0.1, 1.0, 2000)
+    keys = {key_of(p, np.array([0, 1, 0]), level + above) for p, level in zip(positions, levels.tolist(), strict=True)}
+    table = np.array(sorted(keys), np.uint64)
+    cells = with_table(grid_at(LOW, SIDE, GROWTH, BOXES, device), table, np.ones((len(table), 8), np.float32), device)
+    points = wp.array(positions.astype(np.float32), dtype=wp.vec3, device=device)
+    lengths = wp.array(distances.astype(np.float32), dtype=wp.float32, device=device)
+    known = wp.zeros(2000, dtype=wp.float32, device=device)
+    launch.launch(read_from, 2000, [cells, points, lengths, known], device)
+    assert set(levels) == {0} and 0.3 < (distances > side / 2).mean() < 0.7
+    np.testing.assert_array_equal(known.numpy() > 0, (distances > side / 2) & (above < 2))
+
+
+def test_a_table_is_as_large_as_it_says():
+    for count in (0, 1, 100, 1000):
+        keys = np.arange(1, count + 1, dtype=np.uint64) * np.uint64(977)
+        cells = with_table(grid_at(LOW, SIDE, GROWTH, BOXES, st.device()), keys, np.zeros((count, 8)), st.device())
+        assert table_nbytes(keys) == cells.keys.numpy().nbytes + cells.values.numpy().nbytes
 
 
 @pytest.mark.parametrize(("capacity", "kept", "over"), [(9, [3, 4, 6], 0), (2, [3, 6], 1)])

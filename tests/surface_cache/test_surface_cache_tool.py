@@ -10,7 +10,7 @@ import warp_gi as gi
 from warp_gi.cli.main import main
 from warp_gi.errors import OptionError
 from warp_gi.sequence.frames import read_frame
-from warp_gi.techniques.surface_cache.export import FIELDS, cell_points, check_export_name
+from warp_gi.techniques.surface_cache.export import FIELDS, cell_points, check_export_name, export_points
 
 BAKE = ["bake", "cornell_box", "--technique=cache", "--paths=3000", "--picture=32x32"]
 
@@ -69,3 +69,24 @@ def test_what_cannot_be_baked_or_exported(tmp_path, capsys):
         assert told in capsys.readouterr().err
     with pytest.raises(OptionError, match="cannot export to cells"):
         check_export_name(tmp_path / "cells")
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.json"])
+def test_an_export_overwrites_exports_alone(made, tmp_path, name):
+    for file in ("a.ply", "a.json"):
+        (tmp_path / file).write_bytes((made / file).read_bytes())
+    bake = gi.load_bake(made / "a.safetensors")
+    assert export_points(bake, tmp_path / "a.ply") == [tmp_path / "a.ply", tmp_path / "a.json"]
+    assert (tmp_path / "a.ply").read_bytes() == (made / "a.ply").read_bytes()
+    foreign = b'{"format": "ours"}' if name == "a.json" else b"ply\nformat ascii 1.0\ncomment ours\n"
+    for content in (foreign, b"", b"[1]", b"\xff"):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(OptionError, match="exists and is not of an earlier export"):
+            check_export_name(tmp_path / "a.ply")
+        with pytest.raises(OptionError, match="exists and is not of an earlier export"):
+            export_points(bake, tmp_path / "a.ply")
+        assert (tmp_path / name).read_bytes() == content
+    (tmp_path / name).unlink()
+    (tmp_path / name).mkdir()
+    with pytest.raises(OptionError, match="is a folder"):
+        check_export_name(tmp_path / "a.ply")

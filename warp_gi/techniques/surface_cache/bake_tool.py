@@ -11,6 +11,7 @@ from warp_gi.scene.scene import Scene
 from warp_gi.techniques.bake_tool import BakeTool, Rows
 from warp_gi.techniques.surface_cache import pictures
 from warp_gi.techniques.surface_cache.cache import SurfaceCache, check_still
+from warp_gi.techniques.surface_cache.cells import table_nbytes
 from warp_gi.techniques.surface_cache.export import check_export_name, export_points
 
 
@@ -39,7 +40,7 @@ class SurfaceCacheTool(BakeTool[SurfaceCache]):
         check_still(scene)
 
     def check_export(self, settings: SurfaceCache, path: Path, components: int) -> None:
-        """Raise OptionError unless the file is a .ply."""
+        """Raise OptionError unless the file is a .ply, beside which no file of another's would be overwritten."""
         check_export_name(path)
 
     def export(self, bake: Bake, path: Path, scene: Scene, components: int) -> list[Path]:
@@ -63,7 +64,7 @@ class SurfaceCacheTool(BakeTool[SurfaceCache]):
             ("side of a cell [m]", float(bake.arrays["side"][0])),
             ("samples a cell", counts["samples"] / max(counts["cells"], 1)),
             ("seconds", round(seconds, 3)),
-            ("in memory [MB]", bake.nbytes / 1e6),
+            ("in memory [MB]", table_nbytes(bake.arrays["keys"]) / 1e6),
         ]
 
 

@@ -122,6 +122,11 @@ def hash_table(keys: np.ndarray) -> tuple[int, np.ndarray, int]:
     return bits, slots, max(1 << bits, int(slots.max(initial=0)) + 1) + 1
 
 
+def table_nbytes(keys: np.ndarray) -> int:
+    """Return the size of the table of cells, in bytes: a key and 8 float32 a slot."""
+    return hash_table(keys)[2] * (8 + 8 * 4)
+
+
 def with_table(cells: SurfaceCells, keys: np.ndarray, rows: np.ndarray, device: wp.Device) -> SurfaceCells:
     """Return cells on a device whose table holds ``rows`` float32 [cell, 8] by their keys; the grid is as it was."""
     bits, slots, count = hash_table(keys)

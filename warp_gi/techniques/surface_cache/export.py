@@ -26,13 +26,36 @@ TEXT = {
     "lobe": "Mean exitance in W/m^2 by the specular lobe of the surfaces there.",
     "samples": "Number of samples of the means.",
 }
+_HEAD = f"ply\nformat binary_little_endian 1.0\ncomment {FORMAT}\n".encode()
+"""Start of a .ply file, in which it says by whom it is."""
 _COORDINATE = np.uint64((1 << 19) - 1)
 
 
 def check_export_name(path: Path) -> None:
-    """Raise OptionError unless a file is a .ply."""
+    """Raise OptionError unless a file is a .ply, beside which no file of another's would be overwritten.
+
+    An export to hall.ply also writes hall.json; over an earlier export it may write.
+    """
     if path.suffix.lower() != ".ply":
         raise OptionError(f"cannot export to {path.name}: the cells of a surface cache are points in a .ply file")
+    for file in (path, path.with_suffix(".json")):
+        if file.is_dir():
+            raise OptionError(f"{file}: is a folder; give another name")
+        if file.exists() and not _is_exported(file):
+            raise OptionError(
+                f"{file} exists and is not of an earlier export, which would overwrite it: give another name"
+            )
+
+
+def _is_exported(file: Path) -> bool:
+    """Return whether a file says that it is of an export."""
+    try:
+        if file.suffix == ".json":
+            return bool(json.loads(file.read_text(encoding="utf-8"))["format"] == FORMAT)
+        with open(file, "rb") as opened:
+            return opened.read(len(_HEAD)) == _HEAD
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return False
 
 
 def cell_points(bake: Bake) -> np.ndarray:
@@ -50,15 +73,18 @@ def cell_points(bake: Bake) -> np.ndarray:
 
 
 def export_points(bake: Bake, path: Path) -> list[Path]:
-    """Write NAME.ply, binary, and NAME.json, which says what is in it; return both, the description last."""
+    """Write NAME.ply, binary, and NAME.json, which says what is in it; return both, the description last.
+
+    Raises OptionError for other names, and where a file of another's would be overwritten.
+    """
+    check_export_name(path)
     points = cell_points(bake)
-    header = ["ply", "format binary_little_endian 1.0", f"comment {FORMAT}", f"element vertex {len(points)}"]
-    header += [f"property float {name}" for name in FIELDS]
+    header = [f"element vertex {len(points)}", *(f"property float {name}" for name in FIELDS)]
     description = path.with_suffix(".json")
     text = {"format": FORMAT, "version": FORMAT_VERSION, "scene": bake.scene_name, "file": path.name, **TEXT}
     text |= {"cells": len(points), "fields": FIELDS, "bake": bake.digest}
     with replacing(path) as part:
-        part.write_bytes("\n".join([*header, "end_header\n"]).encode() + points.astype("<f4").tobytes())
+        part.write_bytes(_HEAD + "\n".join([*header, "end_header\n"]).encode() + points.astype("<f4").tobytes())
     with replacing(description) as part:
         part.write_text(json.dumps(text, indent=2) + "\n", encoding="utf-8")
     return [path, description]

@@ -25,10 +25,13 @@ FIRST_PASSES, FIRST_SHARE, FIRST_VERTICES = 4, 0.03, 3
 vertex has as many bounces behind it as the path goes on, so the light that a pass lacks is what the pass before lacked
 times the mean of a^k over k = 1 to the number of vertices, where a is the albedo: .42 for .8 and 8 vertices, .17 for
 24."""
+FIRST_PATHS = 250
+"""Smallest number of paths of a first pass: what later passes read behind their last vertices must not be a few cells.
+Where first passes would take more than half of the paths that are asked for, others are traced beside them."""
 LATER_PASSES = 3
 """Number of passes that share the other paths, and are kept."""
-LAUNCH_PATHS = 1 << 16
-"""Largest number of paths of a launch, so that records need no more memory with more paths."""
+LAUNCH_RECORDS = 1 << 19
+"""Largest number of records of a launch, paths times vertices, so that they need no more memory with more of both."""
 SHARE_OF_DIAGONAL, LARGEST_SIDE = 0.01, 0.15
 """Side of a cell near the camera, unless told: a share of the diagonal of the scene, but at most so many metres, as a
 cell must not reach through a wall."""
@@ -88,8 +91,8 @@ def fill(
     """
     boxes = camera_boxes(cameras)
     grid = empty_grid(scene, settings, boxes, device)
-    first = [int(settings.paths * FIRST_SHARE)] * FIRST_PASSES
-    left = settings.paths - sum(first)
+    first = [max(int(settings.paths * FIRST_SHARE), FIRST_PATHS)] * FIRST_PASSES
+    left = max(settings.paths - sum(first), settings.paths // 2)
     counts = [*first, *(left * (k + 1) // LATER_PASSES - left * k // LATER_PASSES for k in range(LATER_PASSES))]
     longer = replace(settings, vertices=settings.vertices * FIRST_VERTICES)
     rows: wp.array = wp.array([camera_data(camera) for camera in cameras], dtype=CameraData, device=device)
@@ -105,7 +108,7 @@ def fill(
             total = total + found if number > FIRST_PASSES else found
         done += count
         if progress is not None:
-            progress(done / max(settings.paths, 1))
+            progress(done / sum(counts))
     known, over = total.with_levels().most_sampled(settings.capacity)
     return Filled(grid, boxes, known, over, vertices)
 
@@ -125,8 +128,9 @@ def _pass(
     query, data, table = kernels.FillSettings(), lit_data(scene, device), ltc_table(device)
     query.cameras, query.pass_paths, query.index = cameras, count, done & 0xFFFFFFFF
     query.seed, query.vertices = seed & 0xFFFFFFFF, settings.vertices
-    for start in range(0, count, LAUNCH_PATHS):
-        paths = min(LAUNCH_PATHS, count - start)
+    most = max(LAUNCH_RECORDS // settings.vertices, 1)
+    for start in range(0, count, most):
+        paths = min(most, count - start)
         size = paths * settings.vertices
         query.first_path = start
         records = kernels.FillRecords()
