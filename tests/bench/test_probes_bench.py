@@ -18,7 +18,7 @@ from warp_gi.bench.suites.probes import rays as probes_rays
 from warp_gi.bench.suites.probes import views as probes_views
 from warp_gi.bench.suites.probes.columns import COLUMNS
 from warp_gi.bench.suites.probes.regions import REGIONS
-from warp_gi.techniques.light_field.places import camera_rows
+from warp_gi.techniques.shared.views import camera_rows
 
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # of bakes for another camera, or for none
 

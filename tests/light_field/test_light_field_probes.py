@@ -26,13 +26,13 @@ from warp_gi.techniques.light_field.places import (
     INSET,
     ProbeGrid,
     lit_bounds,
-    lit_data,
     place_grid,
     probe_grid,
     relocate,
 )
 from warp_gi.techniques.light_field.settings import map_resolution
 from warp_gi.techniques.light_field.state import ProbeState, low_directions
+from warp_gi.techniques.shared.lamps import lit_data
 
 wp.set_module_options({"enable_backward": False})
 

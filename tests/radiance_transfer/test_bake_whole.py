@@ -15,10 +15,10 @@ from warp_gi.bench.harness.scenes import LIVING_ROOM, SCENES
 from warp_gi.errors import BakeError, SceneError
 from warp_gi.techniques.radiance_transfer.atlas import make_atlas
 from warp_gi.techniques.radiance_transfer.bake import bake_transfer, regather, transfer_key
-from warp_gi.techniques.radiance_transfer.bounces import lamps_move
 from warp_gi.techniques.radiance_transfer.rays import trace_slots, transfer_work
 from warp_gi.techniques.radiance_transfer.textures import transfer_textures
 from warp_gi.techniques.radiance_transfer.vertices import vertex_atlas
+from warp_gi.techniques.shared.lamps import lamps_move
 
 ATLAS = ("corners", "face_pages", "charts", "pages", "slots", "corner_slots", "slot_faces", "slot_points", "slot_sides")
 KEYS = [gi.Keyframe(0.0), gi.Keyframe(1.0, translation=(0.0, 1.0, 0.0))]

@@ -14,8 +14,8 @@ from warp_gi.bench.harness.stages import Stage
 from warp_gi.bench.suites.probes.kernels import gather_irradiance, read_irradiance
 from warp_gi.kernels.path_trace import TERM_INDIRECT
 from warp_gi.techniques.light_field.estimator import VISIBILITIES
-from warp_gi.techniques.light_field.places import lit_data
 from warp_gi.techniques.light_field.state import path_settings
+from warp_gi.techniques.shared.lamps import lit_data
 
 
 def path_traced(stage: Stage, spp: int, seed: int) -> np.ndarray:

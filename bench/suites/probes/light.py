@@ -21,7 +21,7 @@ from warp_gi.bench.suites.probes.views import (
     room_views,
     view_of,
 )
-from warp_gi.techniques.light_field.places import lit_data
+from warp_gi.techniques.shared.lamps import lit_data
 
 SPP = 4
 """Samples a pixel of the modes that trace rays."""

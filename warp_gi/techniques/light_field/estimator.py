@@ -21,9 +21,10 @@ from warp_gi.primary import Primary
 from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.camera import Camera, CameraPath
-from warp_gi.techniques.light_field.places import camera_rows, cameras_of, lit_data
 from warp_gi.techniques.light_field.settings import ProbeSettings
 from warp_gi.techniques.light_field.state import ProbeState, path_settings, sky_bytes
+from warp_gi.techniques.shared.lamps import lit_data
+from warp_gi.techniques.shared.views import camera_rows, cameras_of
 
 if TYPE_CHECKING:
     from warp_gi.frame import Frame

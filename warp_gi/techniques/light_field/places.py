@@ -21,11 +21,12 @@ from warp_gi.kernels import light_field_place as kernels
 from warp_gi.kernels import types
 from warp_gi.kernels.light_field import LightField
 from warp_gi.paths import sky_probability
-from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.pinhole import camera_data
 from warp_gi.scene.scene import Scene
 from warp_gi.techniques.light_field.settings import FEW_PROBES, MOST_PROBES, ProbeSettings
+from warp_gi.techniques.shared.lamps import lamps_move, lit_data
+from warp_gi.techniques.shared.views import cameras_of
 
 AUTOMATIC_PROBES = 440
 """Largest number of probes where neither counts nor spacing are given."""
@@ -37,9 +38,9 @@ ROOM_SHARE = 0.06
 sees and what is lit from there."""
 AUTOMATIC_STEPS = 12
 """Distances between probes along the longest side of the box, if that does not make too many of them."""
-REACH_PATHS, REACH_CAMERAS, LEAST_REACHED = 40_000, 32, 400
-"""Paths that find what a camera reaches; largest number of frames of a camera path that they start in; and number of
-points that they must find: with fewer, nearly all paths left the scene, and the result is not used."""
+REACH_PATHS, LEAST_REACHED = 40_000, 400
+"""Paths that find what a camera reaches, and number of points that they must find: with fewer, nearly all paths left
+the scene, and the result is not used."""
 REACH_QUANTILE, REACH_MORE = 0.005, 0.1
 """Share of the points that may lie outside of the box on each side, as windows may show what is far away; and how much
 wider first hits among those points make the box, as a share of its size."""
@@ -134,23 +135,6 @@ def place_grid(
     return probe_grid(box, settings.counts, settings.spacing, settings.largest_map, most)
 
 
-def cameras_of(camera: Camera | CameraPath | None, every: bool = False) -> list[Camera]:
-    """Return the cameras of a path's frames: of ``every`` frame, or of ``REACH_CAMERAS`` frames spread over it."""
-    if camera is None:
-        return []
-    if isinstance(camera, Camera):
-        return [camera]
-    count = camera.frame_count
-    frames = np.linspace(0, count - 1, count if every else min(count, REACH_CAMERAS))
-    return [camera.camera(int(frame)) for frame in np.unique(np.round(frames))]
-
-
-def camera_rows(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return placement and field of view of cameras, float32 [camera, 13], but not the shape of their pictures."""
-    rows = [[*camera.world_from_camera[:3].ravel(), camera.hfov] for camera in cameras]
-    return np.array(rows, np.float32).reshape(-1, 13)
-
-
 class Space(NamedTuple):
     """What paths from a camera reach."""
 
@@ -206,7 +190,7 @@ def lit_bounds(scene: Scene, device: wp.Device) -> np.ndarray:
     the scene's bounds if nothing is lit, or if emitters move.
     """
     bounds = scene.bounds.astype(np.float64)
-    if _lights_move(scene):
+    if lamps_move(scene):
         return bounds
     at = (np.arange(SLABS) + 0.5) / SLABS
     share = np.stack(np.meshgrid(at, at, at, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -279,19 +263,3 @@ def relocate(scene: Scene, data: types.SceneData, grid: ProbeGrid, field: LightF
     moved = lit.any(axis=1)
     positions[dark[moved]] = candidates[moved, lit[moved].argmax(axis=1)]
     field.positions = wp.array(positions.astype(np.float32), dtype=wp.vec3, device=device)
-
-
-def _lights_move(scene: Scene) -> bool:
-    """Return whether an emitter moves."""
-    emits = [any(max(mesh.material.emission) > 0 for mesh in node.meshes) for node in scene.nodes]
-    carried = {light.node for light in scene.lights}
-    return any(scene.moves(index) and (emits[index] or index in carried) for index in range(len(scene.nodes)))
-
-
-def lit_data(scene: Scene | BakedScene, device: wp.Device) -> types.SceneData:
-    """Return the scene's buffers with emitters picked by power, whatever the pipeline's estimator of them does."""
-    data = launch.copied(scene.data(device), types.SceneData)
-    data.emitters = launch.copied(data.emitters, types.Emitters)
-    if not isinstance(scene, BakedScene) and scene.emitter_count:
-        data.emitters.alias = scene.light_table(device)
-    return data

@@ -22,15 +22,14 @@ from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.scene import Scene
 from warp_gi.techniques.light_field.places import (
     ProbeGrid,
-    camera_rows,
-    cameras_of,
-    lit_data,
     place_grid,
     relocate,
 )
 from warp_gi.techniques.light_field.settings import ProbeSettings, map_resolution
 from warp_gi.techniques.paths.estimators import BsdfPaths
+from warp_gi.techniques.shared.lamps import lit_data
 from warp_gi.techniques.shared.octahedral import unfolded
+from warp_gi.techniques.shared.views import camera_rows, cameras_of
 
 LIGHT_RESOLUTION, DISTANCE_RESOLUTION = 32, 64
 """Texels along a side of the smaller maps that irradiance and moments are filtered from; each is the mean over the

@@ -21,7 +21,6 @@ from warp_gi.techniques.radiance_transfer.bounces import (
     gather_bounces,
     gather_light,
     lamp_irradiance,
-    lamps_move,
     slot_reflectance,
 )
 from warp_gi.techniques.radiance_transfer.buried import without_buried
@@ -41,6 +40,7 @@ from warp_gi.techniques.radiance_transfer.textures import (
     transfer_textures,
 )
 from warp_gi.techniques.radiance_transfer.vertices import vertex_atlas
+from warp_gi.techniques.shared.lamps import lamps_move
 
 STAGES = {"charts": 0.4, "rays": 0.4, "bounces": 0.2}
 """Shares of the work of a bake's stages, for progress alone."""

@@ -79,13 +79,6 @@ def gather_bounces(
     return Bounces(state.bounces.numpy().reshape(count, 3, LIGHT_NUMBERS), done, share)
 
 
-def lamps_move(scene: Scene) -> bool:
-    """Return whether an emissive surface or a light of the scene moves, so that its bounces cannot be baked."""
-    moving = set(scene.moving_objects.values())
-    shining = any(max(mesh.material.emission) > 0.0 for index in moving for mesh in scene.nodes[index].meshes)
-    return shining or any(light.node is not None and scene.moves(light.node) for light in scene.lights)
-
-
 def lamp_irradiance(work: TransferWork, scene: Scene, seed: int, progress: Progress | None = None) -> np.ndarray:
     """Return the irradiance [W/m^2] by light that comes straight from the scene's emitters, float32 [slots, 3].
 

@@ -22,6 +22,7 @@ from warp_gi.scene.scene import Scene
 from warp_gi.techniques.radiance_transfer.gltf_export import GENERATOR, glb
 from warp_gi.techniques.radiance_transfer.pca import CompressedBounces, compress_bounces
 from warp_gi.techniques.radiance_transfer.textures import LIGHT_NUMBERS, Atlas, TransferTextures, transfer_textures
+from warp_gi.techniques.shared.exports import check_own
 from warp_gi.techniques.shared.exr_parts import Part, write_exr_parts
 from warp_gi.techniques.shared.octahedral_atlas import warn_if_too_large
 
@@ -127,29 +128,19 @@ def check_export_name(path: str | Path) -> None:
     path = Path(path)
     if path.suffix.lower() != ".exr":
         raise OptionError(f"cannot write {path.name}: transfer textures are .exr files; give NAME.exr")
-    for file in exported_files(path).values():
-        if file.is_dir():
-            raise OptionError(f"{file}: is a folder; give another name")
-        if file.exists() and not _is_exported(file):
-            raise OptionError(
-                f"{file} exists and is not of an earlier export, which would overwrite it: give another name"
-            )
+    check_own(exported_files(path).values(), _says_so)
 
 
-def _is_exported(file: Path) -> bool:
-    """Return whether a file says that it is of an export."""
-    try:
-        if file.suffix == ".json":
-            return bool(json.loads(file.read_text())["format"] == FORMAT)
-        with open(file, "rb") as opened:
-            head = opened.read(HEAD)
-            if file.suffix == ".glb":  # 12 bytes of header, then the length of the JSON chunk, its type and itself
-                opened.seek(20)
-                said = json.loads(opened.read(int.from_bytes(head[12:16], "little")))
-                return bool(said["asset"]["generator"] == GENERATOR)
-        return DIGEST.encode() in head
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return False
+def _says_so(file: Path) -> bool:
+    if file.suffix == ".json":
+        return bool(json.loads(file.read_text())["format"] == FORMAT)
+    with open(file, "rb") as opened:
+        head = opened.read(HEAD)
+        if file.suffix == ".glb":  # 12 bytes of header, then the length of the JSON chunk, its type and itself
+            opened.seek(20)
+            said = json.loads(opened.read(int.from_bytes(head[12:16], "little")))
+            return bool(said["asset"]["generator"] == GENERATOR)
+    return DIGEST.encode() in head
 
 
 def page_images(

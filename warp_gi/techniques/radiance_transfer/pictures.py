@@ -15,10 +15,10 @@ from warp_gi.scene.camera import Camera
 from warp_gi.scene.scene import Scene
 from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence.preview import magma, tone_map, write_pngs
-from warp_gi.techniques.radiance_transfer.bounces import lamps_move
 from warp_gi.techniques.radiance_transfer.estimator import RadianceTransfer
 from warp_gi.techniques.radiance_transfer.export import SIDES
 from warp_gi.techniques.radiance_transfer.textures import TransferTextures, transfer_textures
+from warp_gi.techniques.shared.lamps import lamps_move
 from warp_gi.techniques.shared.legends import exposure_of, scale_bar, stacked, with_keys
 
 PAGE_PIXELS = 2048

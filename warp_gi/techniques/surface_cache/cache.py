@@ -17,7 +17,7 @@ from warp_gi.kernels.surface_cache import SURFACE_CACHE, SurfaceCells
 from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import whole_scene
 from warp_gi.stateful import Ahead
-from warp_gi.techniques.light_field.places import camera_rows, cameras_of
+from warp_gi.techniques.shared.views import camera_rows, cameras_of
 from warp_gi.techniques.surface_cache.cells import with_table
 from warp_gi.techniques.surface_cache.fill import FillSettings, fill, grid_at
 

@@ -10,6 +10,7 @@ import numpy as np
 from warp_gi.baking import Bake
 from warp_gi.errors import OptionError
 from warp_gi.files import replacing
+from warp_gi.techniques.shared.exports import check_own
 
 FORMAT, FORMAT_VERSION = "warp_gi surface cache", 1
 FIELDS = (
@@ -38,24 +39,14 @@ def check_export_name(path: Path) -> None:
     """
     if path.suffix.lower() != ".ply":
         raise OptionError(f"cannot export to {path.name}: the cells of a surface cache are points in a .ply file")
-    for file in (path, path.with_suffix(".json")):
-        if file.is_dir():
-            raise OptionError(f"{file}: is a folder; give another name")
-        if file.exists() and not _is_exported(file):
-            raise OptionError(
-                f"{file} exists and is not of an earlier export, which would overwrite it: give another name"
-            )
+    check_own((path, path.with_suffix(".json")), _says_so)
 
 
-def _is_exported(file: Path) -> bool:
-    """Return whether a file says that it is of an export."""
-    try:
-        if file.suffix == ".json":
-            return bool(json.loads(file.read_text(encoding="utf-8"))["format"] == FORMAT)
-        with open(file, "rb") as opened:
-            return opened.read(len(_HEAD)) == _HEAD
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return False
+def _says_so(file: Path) -> bool:
+    if file.suffix == ".json":
+        return bool(json.loads(file.read_text(encoding="utf-8"))["format"] == FORMAT)
+    with open(file, "rb") as opened:
+        return opened.read(len(_HEAD)) == _HEAD
 
 
 def cell_points(bake: Bake) -> np.ndarray:

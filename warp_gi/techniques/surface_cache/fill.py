@@ -16,7 +16,7 @@ from warp_gi.kernels.surface_cache import LARGEST_COORDINATE, SurfaceCells
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.pinhole import camera_data
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.light_field.places import lit_data
+from warp_gi.techniques.shared.lamps import lit_data
 from warp_gi.techniques.shared.ltc import ltc_table
 from warp_gi.techniques.surface_cache.cells import Sums, with_table
 
