@@ -139,7 +139,7 @@ class Drawing {
 
   // ---- a picture ----
 
-  // `view` has clipFromWorld (columns), skyFromCamera (columns), slopes, sky, weights, exposure and bounced.
+  // `view` has clipFromWorld (columns), skyFromCamera (columns), slopes, sky, weights, whites, range, exposure and bounced.
   draw(view) {
     const { gl, canvas } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.drawn);
@@ -204,6 +204,9 @@ class Drawing {
     ["transfer", "colorImage", "emissionImage"].forEach((name, unit) => gl.uniform1i(uniforms[name], unit));
     gl.uniformMatrix4fv(uniforms.clipFromWorld, false, view.clipFromWorld);
     gl.uniform4fv(uniforms.weights, view.weights);
+    gl.uniform4fv(uniforms.whites, view.whites);
+    gl.uniform3fv(uniforms.least, view.range[0]);
+    gl.uniform3fv(uniforms.most, view.range[1]);
     gl.uniform1f(uniforms.bounced, view.bounced ? 1 : 0);
     for (const group of about.groups) {
       gl.disable(gl.POLYGON_OFFSET_FILL);

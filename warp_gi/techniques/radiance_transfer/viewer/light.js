@@ -52,6 +52,9 @@ function turnedLight(light, rotation, sphere) {
   return result;
 }
 
+// Light of a sky of radiance 1.
+const WHITE = [0, 1, 2].map(() => Float64Array.of(Math.sqrt(4 * Math.PI), ...new Array(COUNT - 1).fill(0)));
+
 // What the four numbers of each layer are multiplied by, a vec4 for red, green and blue each: T by light, bounces by
 // light seen through their components. Lamps, in the last layer of T, are no matter of the sky.
 function layerWeights(light, components, layers, directLayers) {

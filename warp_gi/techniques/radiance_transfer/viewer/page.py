@@ -162,6 +162,7 @@ def _fixed(scene: Scene, shown: Surfaces, sky_list: list[skies.PageSky]) -> _Fix
             {
                 "name": one.name,
                 "light": [[float(f"{number:.7g}") for number in row] for row in one.light],
+                "range": [part.tolist() for part in one.range],
                 "rotation": one.rotation,
                 "map": parts.add(np.moveaxis(one.pixels, -1, 0)),
             }

@@ -14,7 +14,8 @@ void main() {
   gl_Position = clipFromWorld * vec4(position, 1.0);
 }`;
 
-// albedo / pi (L . T + L . B + lamps). A sum of few harmonics may be below 0.
+// albedo / pi (L . T + L . B + lamps). A sum of few harmonics swings about what a sky can bring: it is kept to what its
+// darkest and its brightest part would bring all over it.
 function surfaceFragment(layers, directLayers) {
   return `${HEAD}
 const int LAYERS = ${layers};
@@ -25,6 +26,9 @@ uniform sampler2DArray transfer;
 uniform sampler2D colorImage;
 uniform sampler2D emissionImage;
 uniform vec4 weights[3 * LAYERS];
+uniform vec4 whites[3 * LAYERS]; // of a sky of radiance 1
+uniform vec3 least;
+uniform vec3 most;
 uniform vec3 color;
 uniform vec3 emission;
 uniform vec2 coverage; // factor of alpha, and what is a hole below it
@@ -33,15 +37,23 @@ out vec4 result;
 void main() {
   vec4 base = texture(colorImage, vUv);
   if (base.a * coverage.x < coverage.y) discard;
-  vec3 direct = vec3(0.0), indirect = vec3(0.0), lamps = vec3(0.0);
+  vec3 direct = vec3(0.0), indirect = vec3(0.0), lamps = vec3(0.0), open = vec3(0.0), around = vec3(0.0);
   for (int k = 0; k < LAYERS; k++) {
     vec4 texel = texture(transfer, vec3(vPlace, float(k)));
     vec3 light = vec3(dot(texel, weights[3 * k]), dot(texel, weights[3 * k + 1]), dot(texel, weights[3 * k + 2]));
-    if (k < DIRECT) direct += light;
-    else indirect += light;
+    vec3 white = vec3(dot(texel, whites[3 * k]), dot(texel, whites[3 * k + 1]), dot(texel, whites[3 * k + 2]));
+    if (k < DIRECT) {
+      direct += light;
+      open += white;
+    } else {
+      indirect += light;
+      around += white;
+    }
     if (k == DIRECT - 1) lamps = texel.yzw;
   }
-  vec3 irradiance = max(direct, 0.0) + bounced * (max(indirect, 0.0) + lamps);
+  direct = clamp(direct, least * max(open, 0.0), most * max(open, 0.0));
+  indirect = max(indirect, least * max(around, 0.0));
+  vec3 irradiance = direct + bounced * (indirect + lamps);
   vec3 light = color * base.rgb * irradiance / 3.14159265358979 + emission * texture(emissionImage, vUv).rgb;
   result = vec4(min(light, 65504.0), 1.0);
 }`;

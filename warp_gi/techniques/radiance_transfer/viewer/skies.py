@@ -10,6 +10,7 @@ import numpy as np
 from warp_gi.color import LUMINANCE
 from warp_gi.kernels.transfer_snippets import LIGHT_ORDER
 from warp_gi.scene.environment import Environment
+from warp_gi.techniques.radiance_transfer.sky import radiance_range
 
 LARGEST_HEIGHT = 512
 """Rows of the map behind the scene."""
@@ -25,6 +26,8 @@ class PageSky:
     """Its name in the page."""
     light: np.ndarray
     """Harmonics in world space, float64 [3, 25], W/(m^2 sr)."""
+    range: tuple[np.ndarray, np.ndarray]
+    """Least and most radiance of its parts, float64 [3] each, W/(m^2 sr)."""
     pixels: np.ndarray
     """Map in its own space, as of ``Environment``, float16 [height, 2 * height, 3]."""
     rotation: float
@@ -50,7 +53,7 @@ def page_sky(name: str, sky: Environment) -> PageSky:
     else:
         pixels = smaller_map(sky.pixels, min(LARGEST_HEIGHT, len(sky.pixels))) * sky.scale
     halves = np.minimum(pixels, np.finfo(np.float16).max).astype(np.float16)
-    return PageSky(name, sky.harmonics_of(LIGHT_ORDER), halves, sky.rotation)
+    return PageSky(name, sky.harmonics_of(LIGHT_ORDER), radiance_range(sky), halves, sky.rotation)
 
 
 def smaller_map(pixels: np.ndarray, height: int) -> np.ndarray:

@@ -119,6 +119,8 @@ class Viewer {
       slopes: view.slopes(aspect),
       sky: state.sky,
       weights: layerWeights(light, about.components, about.layers, DIRECT_LAYERS),
+      whites: layerWeights(WHITE, about.components, about.layers, DIRECT_LAYERS),
+      range: sky.range,
       exposure: state.exposure,
       bounced: state.bounces,
     });
