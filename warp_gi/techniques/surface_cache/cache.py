@@ -59,7 +59,6 @@ class SurfaceCache(RadianceCache):
     capacity: int = 1 << 19
     """Largest number of cells, of 80 to 160 bytes each with the empty places of the table. Those with the fewest
     samples find no place, and a warning tells of them."""
-
     traced_below: float = 0.2
     """Roughness below which the specular lobe of a surface where a path ends is traced by one more ray, not read."""
     residual: float = 0.0
@@ -75,7 +74,6 @@ class SurfaceCache(RadianceCache):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise OptionError(f"{name} must be finite and not negative, got {value}")
-
         if not 0 <= self.traced_below <= 1:
             raise OptionError(f"traced_below must be a roughness from 0 to 1, got {self.traced_below}")
         if not (self.residual == 0 or 0.01 <= self.residual <= 1):
