@@ -2,8 +2,9 @@
 
 A cell is a cube of a regular grid, seen on one side of one axis: surfaces that face another way have cells of their
 own. Cells are small near the camera's path, and double in size with the distance from it; every point lies in cells of
-several sizes, of which paths read the finest that enough samples fell into. The table is an open-addressed one with
-linear probing; slots after the last keep those that overflow, and the very last one is empty.
+several sizes, of which paths read the finest that enough samples fell into. An object that moves has a grid of its own,
+in the pose in which it was at time 0, and takes its cells along. The table is an open-addressed one with linear
+probing; slots after the last keep those that overflow, and the very last one is empty.
 """
 
 import warp as wp
@@ -20,9 +21,17 @@ wp.set_module_options({"enable_backward": False})
 LEVELS = wp.constant(5)  # sizes of cells that a point lies in, each twice the one before
 READ_LEVELS = wp.constant(2)  # that paths of a picture read: wider cells reach through walls; those are for fills
 LARGEST_LEVEL = wp.constant(10)  # of the smallest of them, so that the key has room for all
-LARGEST_COORDINATE = wp.constant((1 << 19) - 1)  # of a cell of level 0, along an axis
+LARGEST_COORDINATE = wp.constant((1 << 16) - 1)  # of a cell of level 0, along an axis
+MOST_OBJECTS = wp.constant((1 << 9) - 1)  # that have a grid of their own; others share grids
 NEAR = wp.constant(wp.float32(0.5))  # sides of a cell below which matt surfaces are too near to each other to read one
 LEAST_LOBE = wp.constant(wp.float32(0.3))  # probability, at least, of tracing a lobe that is not read
+
+
+# Grid of an object.
+@wp.struct
+class ObjectGrid:
+    number: wp.int32  # in keys, 1 to MOST_OBJECTS; 0: the grid of all that is at rest
+    rest_from_world: wp.mat44  # from the pose of this frame to that at time 0, for numbers above 0
 
 
 # What paths read. A cell is two rows of `values`: irradiance [W/m^2] by all light, and the number of samples; then the
@@ -34,6 +43,7 @@ class SurfaceCells:
     growth: wp.float32  # largest side of a cell over its distance from the camera's path, above level 0
     traced_below: wp.float32  # roughness below which the GGX lobe is traced, and not read
     residual: wp.float32  # share of paths that go on and correct what cells say
+    objects: wp.array(dtype=ObjectGrid)  # [object]; empty where nothing moves
     boxes: wp.array(dtype=wp.vec3)  # [2 * box] low and high corners around pieces of the camera's path, metres
     bits: wp.int32  # the table has 2^bits slots, and a few more
     keys: wp.array(dtype=wp.uint64)  # [slot]; 0: empty
@@ -58,23 +68,25 @@ def cell_level(cells: SurfaceCells, position: wp.vec3) -> wp.int32:
     return level
 
 
-# Key of 64 bits from coordinates of a cell of level 0 around a point, the side that is seen and the level: 19 bits a
-# coordinate, 3 of axis and sign, 4 of the level + 1, so that no key is 0.
+# Key of 64 bits from the grid's number, coordinates of a cell of level 0 around a point, the side that is seen and the
+# level: 9 bits of the number, 16 a coordinate, 3 of axis and sign, 4 of the level + 1, so that no key is 0.
 @wp.func_native(
     snippet="""
     typedef unsigned long long Word;
-    return ((Word)(x >> level) << 45) | ((Word)(y >> level) << 26) | ((Word)(z >> level) << 7)
+    return ((Word)number << 55) | ((Word)(x >> level) << 39) | ((Word)(y >> level) << 23) | ((Word)(z >> level) << 7)
         | ((Word)side << 4) | (Word)(level + 1);
 """
 )
-def packed_key(x: wp.int32, y: wp.int32, z: wp.int32, side: wp.int32, level: wp.int32) -> wp.uint64: ...
+def packed_key(
+    number: wp.int32, x: wp.int32, y: wp.int32, z: wp.int32, side: wp.int32, level: wp.int32
+) -> wp.uint64: ...
 
 
 # Key of the cell of the next level around a cell.
 @wp.func_native(
     snippet="""
     typedef unsigned long long Word;
-    return (((Word)key >> 1) & 0x7fffeffffdffff80ull) + ((Word)key & 0x7full) + 1ull;
+    return (((Word)key >> 1) & 0x003fffbfffbfff80ull) + ((Word)key & 0xff8000000000007full) + 1ull;
 """
 )
 def coarser_key(key: wp.uint64) -> wp.uint64: ...
@@ -109,14 +121,28 @@ def cell_coordinate(offset: wp.float32, side: wp.float32) -> wp.int32:
     return wp.int32(wp.clamp(wp.floor(offset / side), 0.0, wp.float32(LARGEST_COORDINATE)))
 
 
-# Key of the cell of a level at a point that is seen from the side of the unit normal.
+# Grid of the object that a triangle belongs to.
 @wp.func
-def cell_key(cells: SurfaceCells, position: wp.vec3, normal: wp.vec3, level: wp.int32) -> wp.uint64:
-    p = position - cells.low
+def object_grid(cells: SurfaceCells, scene: SceneData, face: wp.int32) -> ObjectGrid:
+    grid = ObjectGrid()
+    if cells.objects.shape[0] > 0:
+        grid = cells.objects[scene.geometry.objects[face]]
+    return grid
+
+
+# Key of the cell of a level at a point of an object that is seen from the side of the unit normal.
+@wp.func
+def cell_key(cells: SurfaceCells, grid: ObjectGrid, position: wp.vec3, normal: wp.vec3, level: wp.int32) -> wp.uint64:
+    p = position
+    n = normal
+    if grid.number > 0:
+        p = wp.transform_point(grid.rest_from_world, p)
+        n = wp.transform_vector(grid.rest_from_world, n)
+    p = p - cells.low
     x = cell_coordinate(p[0], cells.side)
     y = cell_coordinate(p[1], cells.side)
     z = cell_coordinate(p[2], cells.side)
-    return packed_key(x, y, z, side_of(normal), level)
+    return packed_key(grid.number, x, y, z, side_of(n), level)
 
 
 # Slot of a cell; -1: it is not in the table.
@@ -135,11 +161,13 @@ def cell_slot(cells: SurfaceCells, key: wp.uint64) -> wp.int32:
 # Slot of the finest cell of `levels` sizes that is known around a point, read at a random place in the tangent plane
 # within a cell of it, which hides the cells' borders, or else at the point itself; -1: none is known.
 @wp.func
-def known_slot(cells: SurfaceCells, s: Surface, level: wp.int32, levels: wp.int32, u: wp.vec2) -> wp.int32:
+def known_slot(
+    cells: SurfaceCells, grid: ObjectGrid, s: Surface, level: wp.int32, levels: wp.int32, u: wp.vec2
+) -> wp.int32:
     side = cells.side * wp.float32(1 << level)
     across = frame_of(s.normal) * wp.vec3((u[0] - 0.5) * side, (u[1] - 0.5) * side, 0.0)
-    beside = cell_key(cells, s.position + across, s.normal, level)
-    here = cell_key(cells, s.position, s.normal, level)
+    beside = cell_key(cells, grid, s.position + across, s.normal, level)
+    here = cell_key(cells, grid, s.position, s.normal, level)
     slot = int(-1)
     for _k in range(levels):
         if slot < 0:
@@ -186,7 +214,8 @@ def surface_lookup(
     cells: SurfaceCells, scene: SceneData, s: Surface, wo: wp.vec3, hit: BvhHit, pdf: wp.float32, u: wp.vec2
 ) -> KnownRadiance:
     known = KnownRadiance()
-    slot = known_slot(cells, s, cell_level(cells, s.position), READ_LEVELS, u)
+    grid = object_grid(cells, scene, hit.face)
+    slot = known_slot(cells, grid, s, cell_level(cells, s.position), READ_LEVELS, u)
     if slot < 0:
         return known
     nearest = NEAR * side_in_slot(cells, slot)

@@ -36,7 +36,15 @@ from warp_gi.kernels.sampling import (
     sample_2d,
 )
 from warp_gi.kernels.surface import Surface, ray_origin, shading_normal, surface_at, surface_emission
-from warp_gi.kernels.surface_cache import LEVELS, SurfaceCells, cell_exitance, cell_key, cell_level, known_slot
+from warp_gi.kernels.surface_cache import (
+    LEVELS,
+    SurfaceCells,
+    cell_exitance,
+    cell_key,
+    cell_level,
+    known_slot,
+    object_grid,
+)
 from warp_gi.kernels.types import ENVIRONMENT_MAP, ENVIRONMENT_NONE, SceneData
 
 wp.set_module_options({"enable_backward": False})
@@ -187,7 +195,8 @@ def fill_cells(
         d = PATH_DIMENSION + met * VERTEX_DIMENSIONS
         step = fill_step(scene, table, s, -direction, index, settings.seed, d)
         at = start + met
-        records.keys[at] = cell_key(cells, s.position, s.normal, cell_level(cells, s.position))
+        grid = object_grid(cells, scene, hit.face)
+        records.keys[at] = cell_key(cells, grid, s.position, s.normal, cell_level(cells, s.position))
         records.irradiance[at] = step.irradiance
         records.exitance[at] = step.exitance
         records.diffuse[at] = wp.cw_mul(diffuse_share(s.bsdf), s.bsdf.diffuse)
@@ -200,7 +209,8 @@ def fill_cells(
         s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
         d = PATH_DIMENSION + met * VERTEX_DIMENSIONS + CACHE_PLACE_DIMENSION
         place = wp.vec2(random_1d(index, settings.seed, d), random_1d(index, settings.seed, d + 1))
-        slot = known_slot(cells, s, cell_level(cells, s.position), LEVELS, place)
+        grid = object_grid(cells, scene, hit.face)
+        slot = known_slot(cells, grid, s, cell_level(cells, s.position), LEVELS, place)
         if slot >= 0:
             arrives = cell_exitance(cells, slot, s.bsdf, 1)
     for k in range(met):

@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_gi.kernels.gbuffer import PrimaryHits
 from warp_gi.kernels.surface import surface_at
-from warp_gi.kernels.surface_cache import READ_LEVELS, SurfaceCells, cell_level, known_slot
+from warp_gi.kernels.surface_cache import READ_LEVELS, SurfaceCells, cell_level, known_slot, object_grid
 from warp_gi.kernels.types import SceneData
 
 wp.set_module_options({"enable_backward": False})
@@ -24,4 +24,5 @@ def view_slots(
     if face < 0:
         return
     s = surface_at(scene, face, hits.u[pixel], hits.v[pixel], -hits.direction[pixel])
-    slots[pixel] = known_slot(cells, s, cell_level(cells, s.position), READ_LEVELS, wp.vec2(MIDDLE, MIDDLE))
+    grid = object_grid(cells, scene, face)
+    slots[pixel] = known_slot(cells, grid, s, cell_level(cells, s.position), READ_LEVELS, wp.vec2(MIDDLE, MIDDLE))

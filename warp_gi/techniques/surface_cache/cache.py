@@ -18,8 +18,9 @@ from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import whole_scene
 from warp_gi.stateful import Ahead
 from warp_gi.techniques.shared.views import camera_rows, cameras_of
-from warp_gi.techniques.surface_cache.cells import with_table
-from warp_gi.techniques.surface_cache.fill import FillSettings, fill, grid_at
+from warp_gi.techniques.surface_cache.cells import NOTHING, with_table
+from warp_gi.techniques.surface_cache.fill import FillSettings, camera_boxes, empty_grid, fill, grid_at
+from warp_gi.techniques.surface_cache.state import CacheState, Refresh, followed, is_moving
 
 if TYPE_CHECKING:
     from warp_gi.baking import Setting
@@ -65,8 +66,17 @@ class SurfaceCache(RadianceCache):
     """Share of paths that go on where others end, and correct what cells say: with any share above 0 pictures are
     unbiased, with more noise the smaller it is. 0 corrects nothing."""
 
+    refresh: int = 20_000
+    """Number of paths that each frame adds in a scene that moves, at least 1000; others add none."""
+    memory: float = 0.5
+    """Weight that a sample has one frame later in a scene that moves, in [0, 0.99]. A larger one has less noise, and
+    shows changes of the light later."""
+
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
+        check_whole("refresh", self.refresh, LEAST_PATHS, 1 << 30)
+        if not 0 <= self.memory <= 0.99:
+            raise OptionError(f"memory must be a weight from 0 to 0.99, got {self.memory}")
         check_whole("paths", self.paths, LEAST_PATHS, 1 << 30)
         check_whole("vertices", self.vertices, 1, 64)
         check_whole("capacity", self.capacity, 1, 1 << 26)
@@ -87,8 +97,8 @@ class SurfaceCache(RadianceCache):
     # ---- bake ----
 
     def bake_key(self, scene: Scene | BakedScene) -> str:
-        """Return the hash of all of the scene, its sky too."""
-        return scene.hash
+        """Return the hash of all of the scene, but not of a sky that changes over time."""
+        return scene.contents_hash if scene.is_sky_animated else scene.hash
 
     def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Setting]:
         """Return the settings that a bake depends on."""
@@ -104,36 +114,39 @@ class SurfaceCache(RadianceCache):
     ) -> Bake:
         """Return the cells that paths from every frame of ``camera`` fill; the scene's own cameras stand for None.
 
-        Raises OptionError without a camera, SceneError for a scene or a sky that moves.
+        Of a scene that moves the bake has no cells, only where they lie: frames fill them. Raises OptionError without
+        a camera.
         """
-        check_still(scene)
         cameras = cameras_of(camera, every=True) or list(scene.cameras.values())
         if not cameras:
             raise OptionError(
                 "a surface cache is filled from where the scene is seen, and no camera is known: give a camera"
             )
-        settings = self.fill_settings
-        filled = fill(scene, settings, cameras, launch.get_device(device), seed, progress)
-        if filled.over:
+        settings, target = self.fill_settings, launch.get_device(device)
+        boxes = camera_boxes(cameras)
+        grid, sums, vertices = empty_grid(scene, settings, boxes, target), NOTHING, 0
+        if not is_moving(scene):
+            sums, vertices = fill(scene, settings, grid, cameras, target, seed, progress)
+        cells, over = sums.with_levels().most_sampled(settings.capacity)
+        if over:
             warnings.warn(
-                f"the surface cache is full: it keeps {self.capacity:,} cells, and {filled.over:,} with fewer samples "
+                f"the surface cache is full: it keeps {self.capacity:,} cells, and {over:,} with fewer samples "
                 "found no place; light is blurred over larger cells there, and may leak through walls: "
                 "raise capacity, cell or growth",
                 stacklevel=2,
             )
-        grid, cells = filled.grid, filled.cells
         arrays = {
             "keys": cells.keys,
             "cells": cells.means(),
             "low": np.array(grid.low, np.float32),
             "side": np.array([grid.side], np.float32),
-            "boxes": filled.boxes,
+            "boxes": boxes,
             "cameras": camera_rows(cameras),
         }
         counts: dict[str, int | float] = {
             "cells": len(cells.keys),
-            "cells_over": filled.over,
-            "vertices": filled.vertices,
+            "cells_over": over,
+            "vertices": vertices,
             "samples": int(cells.counts.sum()),
         }
         return Bake("SurfaceCache", self.bake_key(scene), settings.stored(), arrays, counts, scene.name)
@@ -157,38 +170,49 @@ class SurfaceCache(RadianceCache):
                 stacklevel=2,
             )
 
-    def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> SurfaceCells:
-        """Return the cells on the device.
+    def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> CacheState:
+        """Return the cells on the device; none yet in a scene that moves.
 
-        Raises SceneError for a scene that moves, BakeError for arrays that do not fit together.
+        Raises BakeError for arrays that do not fit together.
         """
-        check_still(whole_scene(scene))
-        bake = bake or self.bake(whole_scene(scene), device, seed)
+        whole, target = whole_scene(scene), launch.get_device(device)
+        bake = bake or self.bake(whole, device, seed)
         _check_arrays(bake)
-        target, arrays = launch.get_device(device), bake.arrays
+        arrays = bake.arrays
         grid: SurfaceCells = grid_at(arrays["low"], float(arrays["side"][0]), self.growth, arrays["boxes"], target)
         grid.traced_below, grid.residual = self.traced_below, self.residual
-        return with_table(grid, arrays["keys"], arrays["cells"], target)
+        cells = with_table(grid, arrays["keys"], arrays["cells"], target)
+        return CacheState(cells, follows=bool(is_moving(whole)))
 
     # ---- frames ----
 
-    def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
-        """Return False: the bake is all that is kept."""
-        return False
+    def preprocess(self, frame: Frame, state: CacheState) -> CacheState:
+        """Return the cells of this frame: in a scene that moves they get new samples, and old ones lose weight."""
+        if not state.follows:
+            return state
+        return followed(frame, state, self.fill_settings, Refresh(self.refresh, self.memory))
 
-    def give(self, frame: Frame, state: SurfaceCells) -> None:
+    def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
+        """Return whether the scene or its sky moves; of one at rest the bake is all that is kept."""
+        return bool(is_moving(scene))
+
+    @property
+    def saves_state(self) -> bool:
+        """True: cells hold all that earlier frames left."""
+        return True
+
+    def give(self, frame: Frame, state: CacheState) -> None:
         """Let paths end in the cells."""
-        frame.paths.use_cache(SURFACE_CACHE, state)
+        frame.paths.use_cache(SURFACE_CACHE, state.cells)
 
 
 def check_still(scene: Scene) -> None:
-    """Raise SceneError for a scene in which something moves, or whose sky does."""
-    moving = [node.name for index, node in enumerate(scene.nodes) if scene.moves(index)]
-    if moving or scene.is_sky_animated:
-        what = f"{moving[0]!r} moves" if moving else "the sky changes over time"
+    """Raise SceneError for a scene in which something moves, or whose sky does: there is nothing to bake."""
+    moving = is_moving(scene)
+    if moving:
         raise SceneError(
-            f"a surface cache holds the light of a scene at rest, and here {what}; "
-            "take indirect=BsdfPaths() without ends_in"
+            f"a surface cache is baked of a scene at rest, and here {moving}: there frames fill the cells as they are "
+            "rendered; leave the bake out"
         )
 
 

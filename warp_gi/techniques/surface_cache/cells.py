@@ -20,8 +20,10 @@ LEAST_SAMPLES = 4
 """Samples of a cell from which on it is read."""
 LEAST_BITS = 8
 """Bits of the size of the smallest table."""
-_PARENT = np.uint64(0x7FFFEFFFFDFFFF80)
+_PARENT = np.uint64(0x003FFFBFFFBFFF80)
 """Bits of the coordinates of a key that may be set one level higher."""
+_KEPT = np.uint64(0xFF8000000000007F)
+"""Bits of the grid's number, the side and the level."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,13 +33,14 @@ class Sums:
     keys: np.ndarray
     """uint64 [cell], ascending, none of them 0."""
     light: np.ndarray
-    """Sums of irradiance, and of exitance by the GGX lobe, W/m^2, float64 [cell, 6]."""
+    """Sums of irradiance, of exitance by the GGX lobe, W/m^2, and of the square of the irradiance's luminance, float64
+    [cell, 7]."""
     counts: np.ndarray
-    """Number of samples, int64 [cell]."""
+    """Number of samples, int64 [cell]; or the sum of their weights, float64 [cell]."""
 
     @staticmethod
     def of(keys: np.ndarray, light: np.ndarray, counts: np.ndarray | None = None) -> Sums:
-        """Return the sums of records with keys uint64 [record], light [record, 6] and counts, 1 unless given.
+        """Return the sums of records with keys uint64 [record], light [record, 7] and counts, 1 unless given.
 
         Records with the key 0, and those that are not finite, are left out.
         """
@@ -47,7 +50,7 @@ class Sums:
         ordered = keys[order]
         starts = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1])) if len(order) else order
         if not len(order):
-            return Sums(ordered, np.zeros((0, 6)), np.zeros(0, np.int64))
+            return Sums(ordered, np.zeros((0, 7)), np.zeros(0, np.int64))
         return Sums(
             ordered[starts],
             np.add.reduceat(light[order].astype(np.float64), starts, axis=0),
@@ -71,6 +74,11 @@ class Sums:
         kept = np.flatnonzero(~np.isin(self.keys, other.keys, assume_unique=True))
         return Sums(self.keys[kept], self.light[kept], self.counts[kept])
 
+    def above(self, least: float) -> Sums:
+        """Return the sums of the cells with at least so many samples."""
+        kept = self.counts >= least
+        return Sums(self.keys[kept], self.light[kept], self.counts[kept])
+
     def with_levels(self) -> Sums:
         """Return the sums of these cells, the smallest at each point, and of those of the levels above them."""
         levels = [self]
@@ -91,13 +99,17 @@ class Sums:
         """Return what kernels read of cells, float32 [cell, 8]: irradiance, samples, exitance of the lobe, 0."""
         rows = np.zeros((len(self.keys), 8), np.float32)
         mean = self.light / self.counts[:, None]
-        rows[:, :3], rows[:, 3], rows[:, 4:7] = mean[:, :3], self.counts, mean[:, 3:]
+        rows[:, :3], rows[:, 3], rows[:, 4:7] = mean[:, :3], self.counts, mean[:, 3:6]
         return rows
+
+
+NOTHING = Sums.of(np.zeros(0, np.uint64), np.zeros((0, 7)))
+"""No cell."""
 
 
 def coarser(keys: np.ndarray) -> np.ndarray:
     """Return the keys of the cells of the next level around cells, uint64 [cell]; as ``coarser_key`` of kernels."""
-    return ((keys >> np.uint64(1)) & _PARENT) + (keys & np.uint64(0x7F)) + np.uint64(1)
+    return ((keys >> np.uint64(1)) & _PARENT) + (keys & _KEPT) + np.uint64(1)
 
 
 def first_slots(keys: np.ndarray, bits: int) -> np.ndarray:

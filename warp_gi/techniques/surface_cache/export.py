@@ -29,7 +29,7 @@ TEXT = {
 }
 _HEAD = f"ply\nformat binary_little_endian 1.0\ncomment {FORMAT}\n".encode()
 """Start of a .ply file, in which it says by whom it is."""
-_COORDINATE = np.uint64((1 << 19) - 1)
+_COORDINATE = np.uint64((1 << 16) - 1)
 
 
 def check_export_name(path: Path) -> None:
@@ -54,7 +54,7 @@ def cell_points(bake: Bake) -> np.ndarray:
     keys, rows = bake.arrays["keys"], bake.arrays["cells"]
     level = (keys & np.uint64(15)).astype(np.int64) - 1
     side = float(bake.arrays["side"][0]) * 2.0**level
-    places = np.stack([(keys >> np.uint64(shift) & _COORDINATE).astype(np.float64) for shift in (45, 26, 7)], axis=1)
+    places = np.stack([(keys >> np.uint64(shift) & _COORDINATE).astype(np.float64) for shift in (39, 23, 7)], axis=1)
     which = (keys >> np.uint64(4) & np.uint64(7)).astype(np.int64)
     normals = np.zeros((len(keys), 3))
     normals[np.arange(len(keys)), which // 2] = 1.0 - 2.0 * (which % 2)

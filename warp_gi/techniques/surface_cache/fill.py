@@ -10,15 +10,16 @@ import warp as wp
 
 from warp_gi import launch
 from warp_gi.baking import Setting
+from warp_gi.color import LUMINANCE
 from warp_gi.kernels import surface_cache_fill as kernels
 from warp_gi.kernels.gbuffer import CameraData
-from warp_gi.kernels.surface_cache import LARGEST_COORDINATE, SurfaceCells
+from warp_gi.kernels.surface_cache import LARGEST_COORDINATE, MOST_OBJECTS, ObjectGrid, SurfaceCells
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.pinhole import camera_data
 from warp_gi.scene.scene import Scene
 from warp_gi.techniques.shared.lamps import lit_data
 from warp_gi.techniques.shared.ltc import ltc_table
-from warp_gi.techniques.surface_cache.cells import Sums, with_table
+from warp_gi.techniques.surface_cache.cells import NOTHING, Sums, with_table
 
 FIRST_PASSES, FIRST_SHARE, FIRST_VERTICES = 4, 0.03, 3
 """Number of first passes, which are dropped, the share of the paths in each, and how many times as long these are. A
@@ -35,6 +36,8 @@ LAUNCH_RECORDS = 1 << 19
 SHARE_OF_DIAGONAL, LARGEST_SIDE = 0.01, 0.15
 """Side of a cell near the camera, unless told: a share of the diagonal of the scene, but at most so many metres, as a
 cell must not reach through a wall."""
+SMALLEST_VOLUME = 1e-18
+"""Smallest volume of a unit cube of an object's own space, m^3, whose placement is inverted."""
 MOST_BOXES = 8
 """Largest number of pieces of the camera's path that have a box each."""
 
@@ -59,48 +62,32 @@ class FillSettings:
         return asdict(self)
 
 
-@dataclass(frozen=True, eq=False)
-class Filled:
-    """Cells as a fill leaves them."""
-
-    grid: SurfaceCells
-    """The grid, with an empty table."""
-    boxes: np.ndarray
-    """Boxes around pieces of the camera's path, float32 [box, 2, 3], metres."""
-    cells: Sums
-    """The cells that are kept, of all levels."""
-    over: int
-    """Number of cells that found no place."""
-    vertices: int
-    """Number of vertices of all paths."""
-
-
 def fill(
     scene: Scene,
     settings: FillSettings,
+    grid: SurfaceCells,
     cameras: Sequence[Camera],
     device: wp.Device,
     seed: int,
     progress: Callable[[float], None] | None = None,
-) -> Filled:
-    """Return the cells that paths from ``cameras`` fill, the frames of a camera's path.
+) -> tuple[Sums, int]:
+    """Return the smallest cells that paths from ``cameras`` fill, and the number of vertices of all paths.
+
+    ``cameras`` are the frames of a camera's path, or one of them. The scene is seen in its pose now.
 
     Paths come in passes. Each pass reads behind its last vertices what the passes before left. What the first passes
     left is dropped when the next one is done, but for cells that it did not meet, as their paths ended in too little
-    light.
+    light. ``grid`` tells the places of cells; what is in its table is not read.
     """
-    boxes = camera_boxes(cameras)
-    grid = empty_grid(scene, settings, boxes, device)
     first = [max(int(settings.paths * FIRST_SHARE), FIRST_PATHS)] * FIRST_PASSES
     left = max(settings.paths - sum(first), settings.paths // 2)
     counts = [*first, *(left * (k + 1) // LATER_PASSES - left * k // LATER_PASSES for k in range(LATER_PASSES))]
     longer = replace(settings, vertices=settings.vertices * FIRST_VERTICES)
-    rows: wp.array = wp.array([camera_data(camera) for camera in cameras], dtype=CameraData, device=device)
-    total, vertices, done = Sums.of(np.zeros(0, np.uint64), np.zeros((0, 6))), 0, 0
+    total, vertices, done = NOTHING, 0, 0
     for number, count in enumerate(counts):
-        known, _ = total.with_levels().most_sampled(settings.capacity)
-        cells = with_table(grid, known.keys, known.means(), device)
-        found = _pass(scene, longer if number < FIRST_PASSES else settings, cells, rows, done, count, seed, device)
+        cells = table_of(grid, total, settings.capacity, device)
+        chosen = longer if number < FIRST_PASSES else settings
+        found = add_pass(scene, chosen, cells, cameras, done, count, seed, device)
         vertices += int(found.counts.sum())
         if number < FIRST_PASSES:
             total = found + total.without(found)
@@ -109,24 +96,33 @@ def fill(
         done += count
         if progress is not None:
             progress(done / sum(counts))
-    known, over = total.with_levels().most_sampled(settings.capacity)
-    return Filled(grid, boxes, known, over, vertices)
+    return total, vertices
 
 
-def _pass(
+def table_of(grid: SurfaceCells, sums: Sums, capacity: int, device: wp.Device) -> SurfaceCells:
+    """Return a grid whose table holds the smallest cells ``sums`` and the levels above them."""
+    known, _ = sums.with_levels().most_sampled(capacity)
+    return with_table(grid, known.keys, known.means(), device)
+
+
+def add_pass(
     scene: Scene,
     settings: FillSettings,
     cells: SurfaceCells,
-    cameras: wp.array,
+    cameras: Sequence[Camera],
     done: int,
     count: int,
     seed: int,
     device: wp.Device,
 ) -> Sums:
-    """Return the sums of a pass of ``count`` paths, whose random numbers come after those of ``done`` others."""
-    total = Sums.of(np.zeros(0, np.uint64), np.zeros((0, 6)))
+    """Return the sums of a pass of ``count`` paths, whose random numbers come after those of ``done`` others.
+
+    The scene is seen in its pose now. Behind their last vertices paths read ``cells``.
+    """
+    total = NOTHING
     query, data, table = kernels.FillSettings(), lit_data(scene, device), ltc_table(device)
-    query.cameras, query.pass_paths, query.index = cameras, count, done & 0xFFFFFFFF
+    query.cameras = wp.array([camera_data(camera) for camera in cameras], dtype=CameraData, device=device)
+    query.pass_paths, query.index = count, done & 0xFFFFFFFF
     query.seed, query.vertices = seed & 0xFFFFFFFF, settings.vertices
     most = max(LAUNCH_RECORDS // settings.vertices, 1)
     for start in range(0, count, most):
@@ -140,7 +136,9 @@ def _pass(
         launch.launch(kernels.fill_cells, paths, [data, table, cells, query, records], device)
         keys = records.keys.numpy()
         kept = np.flatnonzero(keys)
-        light = np.concatenate([records.irradiance.numpy()[kept], records.exitance.numpy()[kept]], axis=1)
+        irradiance, exitance = records.irradiance.numpy()[kept], records.exitance.numpy()[kept]
+        squares = (irradiance.astype(np.float64) @ LUMINANCE) ** 2
+        light = np.concatenate([irradiance, exitance, squares[:, None]], axis=1)
         total = total + Sums.of(keys[kept], light)
     return total
 
@@ -159,7 +157,23 @@ def grid_at(low: np.ndarray, side: float, growth: float, boxes: np.ndarray, devi
     grid = SurfaceCells()
     grid.low, grid.side, grid.growth = wp.vec3(*map(float, low)), side, growth
     grid.boxes = wp.array(boxes.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device)
+    grid.objects = wp.zeros(0, dtype=ObjectGrid, device=device)
     return with_table(grid, np.zeros(0, np.uint64), np.zeros((0, 8), np.float32), device)
+
+
+def object_grids(scene: Scene, time: float, device: wp.Device) -> wp.array:
+    """Return the grids of a scene's objects in their pose at ``time`` [s], ObjectGrid [object]; none if nothing moves.
+
+    An object whose placement has no inverse, as of one that shrinks to nothing, takes the grid of all that is at rest.
+    """
+    moving, objects = scene.moving_objects, len(scene.object_names)
+    rows = np.zeros(objects if moving else 0, ObjectGrid.numpy_dtype())
+    for number, index in moving.items():
+        rest, now = scene.world_from_node(index, 0.0), scene.world_from_node(index, time)
+        if min(abs(np.linalg.det(rest[:3, :3])), abs(np.linalg.det(now[:3, :3]))) > SMALLEST_VOLUME:
+            rows[number]["number"] = 1 + number % int(MOST_OBJECTS)
+            rows[number]["rest_from_world"] = rest @ np.linalg.inv(now)
+    return launch.on_device(rows, ObjectGrid, device)
 
 
 def camera_boxes(cameras: Sequence[Camera]) -> np.ndarray:

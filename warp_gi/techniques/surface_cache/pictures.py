@@ -39,7 +39,7 @@ def write_pictures(
     """
     pipeline = Pipeline(environment=None, emitters=None, indirect=BsdfPaths(ends_in=settings), spp=1, camera_samples=1)
     scheduler = FrameScheduler(scene, camera, pipeline, device, seed, bakes=[bake])
-    frame, cells = scheduler.frame(0), scheduler.state("indirect.ends_in")
+    frame, cells = scheduler.frame(0), scheduler.state("indirect.ends_in").cells
     width, height = camera.resolution
     slots = wp.empty(width * height, dtype=wp.int32, device=frame.device)
     frame.launch(kernels.view_slots, [frame.data, cells, frame.hits, slots])

@@ -1,0 +1,117 @@
+"""The state of a surface cache: the cells that paths read, and in scenes that move the sums that they are made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from warp_gi import launch
+from warp_gi.color import LUMINANCE
+from warp_gi.frame import Frame
+from warp_gi.kernels.surface_cache import SurfaceCells
+from warp_gi.scene.baked import BakedScene, whole_scene
+from warp_gi.techniques.surface_cache.cells import NOTHING, Sums, coarser
+from warp_gi.techniques.surface_cache.fill import FillSettings, add_pass, fill, object_grids, table_of
+
+if TYPE_CHECKING:
+    from warp_gi.scene.scene import Scene
+
+LEAST_LEFT = 0.1
+"""Share of the samples' weight below which what is left of earlier frames is dropped, and all cells are filled anew."""
+LEAST_WEIGHT = 0.05
+"""Weight of a cell's samples, in samples, below which it is forgotten."""
+CHANGE_LEVELS = 2
+"""Levels above the smallest cells at which a change of the light is looked for: single cells have too few samples."""
+LEAST_ERRORS, LEAST_CHANGE = 3.0, 0.15
+"""A change is a difference of so many standard errors, and of such a share of the light."""
+CHANGED = 0.03
+"""Factor on the weight of earlier samples where the light has changed."""
+
+
+@dataclass(frozen=True, eq=False)
+class CacheState:
+    """Cells of one moment. No call changes a state; each returns a new one."""
+
+    cells: SurfaceCells = field(metadata={"derived": True})
+    """Cells as kernels read them."""
+    follows: bool = field(default=False, metadata={"derived": True})
+    """Whether the scene or its sky moves, so that cells follow from frame to frame."""
+    keys: np.ndarray = field(default_factory=lambda: NOTHING.keys)
+    """Keys of the smallest cells, uint64 [cell]; none in a scene at rest, whose cells never change."""
+    light: np.ndarray = field(default_factory=lambda: NOTHING.light)
+    """Weighted sums of their samples, float64 [cell, 7], in the columns of ``Sums``."""
+    weights: np.ndarray = field(default_factory=lambda: NOTHING.counts.astype(np.float64))
+    """Sums of the samples' weights, float64 [cell]."""
+    frame: np.ndarray = field(default_factory=lambda: np.array([-1]))
+    """Number of the frame that the cells are of, int64 [1]; -1 before the first one."""
+
+
+@dataclass(frozen=True)
+class Refresh:
+    """How cells follow what moves; the fields of a SurfaceCache of these names."""
+
+    refresh: int
+    """Number of paths of a frame."""
+    memory: float
+    """Weight of a sample one frame later."""
+
+
+def is_moving(scene: Scene | BakedScene) -> str:
+    """Return what moves in a scene, for messages: \"'crate' moves\", "the sky changes over time", or ""."""
+    moving = [] if isinstance(scene, BakedScene) else [n.name for k, n in enumerate(scene.nodes) if scene.moves(k)]
+    if moving:
+        return f"{moving[0]!r} moves"
+    return "the sky changes over time" if scene.is_sky_animated else ""
+
+
+def followed(frame: Frame, state: CacheState, settings: FillSettings, refresh: Refresh) -> CacheState:
+    """Return the cells of a frame: what earlier frames left, of less weight, and samples of this one.
+
+    After a gap of many frames, and in the first one, all cells are filled anew, by all paths.
+    """
+    scene, device = whole_scene(frame.scene), frame.device
+    grid = launch.copied(state.cells, SurfaceCells)
+    grid.objects = object_grids(scene, frame.time, device)
+    last = int(state.frame[0])
+    left = refresh.memory ** abs(frame.index - last) if last >= 0 else 0.0
+    if left < LEAST_LEFT:
+        sums, _ = fill(scene, settings, grid, [frame.camera], device, frame.seed)
+        sums = Sums(sums.keys, sums.light, sums.counts.astype(np.float64))
+    else:
+        old = Sums(state.keys, left * state.light, left * state.weights).above(LEAST_WEIGHT)
+        cells = table_of(grid, old, settings.capacity, device)
+        new = add_pass(scene, settings, cells, [frame.camera], 0, refresh.refresh, frame.seed, device)
+        sums = still_valid(old, new) + new
+    cells = table_of(grid, sums, settings.capacity, device)
+    here = np.array([frame.index])
+    return replace(state, cells=cells, keys=sums.keys, light=sums.light, weights=sums.counts, frame=here)
+
+
+def still_valid(old: Sums, new: Sums) -> Sums:
+    """Return what was known before a frame, of less weight where the frame's samples say that the light is another.
+
+    In every large cell each sample is compared with the mean of its own small cell, as the camera may look at other
+    parts of it now. Of n differences d around 0 the sum has a variance of about that of d times n, by the samples
+    themselves, and the error of the old means besides.
+    """
+    _, at, by = np.intersect1d(new.keys, old.keys, assume_unique=True, return_indices=True)
+    if not len(at):
+        return old
+    count, weight = new.counts[at].astype(np.float64), old.counts[by]
+    sums, mean = new.light[at, :3] @ LUMINANCE, old.light[by, :3] @ LUMINANCE / weight
+    spread = np.maximum(old.light[by, 6] / weight - mean**2, 0.0) / weight
+    difference = sums - count * mean
+    variance = np.maximum(new.light[at, 6] - 2 * mean * sums + count * mean**2, 0.0) + count**2 * spread
+    around, every = new.keys[at], old.keys
+    for _ in range(CHANGE_LEVELS):
+        around, every = coarser(around), coarser(every)
+    names, group = np.unique(around, return_inverse=True)
+    difference, variance, light = (
+        np.bincount(group, values) for values in (difference, variance, np.maximum(sums, count * mean))
+    )
+    is_sure = np.abs(difference) > LEAST_ERRORS * np.sqrt(variance)
+    changed = names[is_sure & (np.abs(difference) > LEAST_CHANGE * light)]
+    factor = np.where(np.isin(every, changed), CHANGED, 1.0)
+    return Sums(old.keys, old.light * factor[:, None], old.counts * factor)
