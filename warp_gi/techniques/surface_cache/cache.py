@@ -66,9 +66,9 @@ class SurfaceCache(RadianceCache):
     """Share of paths that go on where others end, and correct what cells say: with any share above 0 pictures are
     unbiased, with more noise the smaller it is. 0 corrects nothing."""
 
-    refresh: int = 20_000
+    refresh: int = 15_000
     """Number of paths that each frame adds in a scene that moves, at least 1000; others add none."""
-    memory: float = 0.5
+    memory: float = 0.8
     """Weight that a sample has one frame later in a scene that moves, in [0, 0.99]. A larger one has less noise, and
     shows changes of the light later."""
 

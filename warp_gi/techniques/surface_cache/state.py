@@ -22,12 +22,14 @@ LEAST_LEFT = 0.1
 """Share of the samples' weight below which what is left of earlier frames is dropped, and all cells are filled anew."""
 LEAST_WEIGHT = 0.05
 """Weight of a cell's samples, in samples, below which it is forgotten."""
-CHANGE_LEVELS = 2
-"""Levels above the smallest cells at which a change of the light is looked for: single cells have too few samples."""
-LEAST_ERRORS, LEAST_CHANGE = 3.0, 0.15
-"""A change is a difference of so many standard errors, and of such a share of the light."""
-CHANGED = 0.03
-"""Factor on the weight of earlier samples where the light has changed."""
+LEAST_ERRORS = 3.0
+"""Standard errors of the difference that a change of the light makes, at least."""
+LEAST_CHANGE = {2: 0.15, 3: 0.3, 4: 0.5}
+"""The least share of the light that a change is, by levels above the smallest cells at which it is looked for. Single
+cells have too few samples; for all of a large one to be forgotten, most of its light must be another."""
+MORE_PASSES, MUCH_CHANGED = 2, 0.25
+"""Where such a share of the samples' weight is of light that has changed, so many more passes replace the first: its
+paths ended in the light before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,15 +84,23 @@ def followed(frame: Frame, state: CacheState, settings: FillSettings, refresh: R
     else:
         old = Sums(state.keys, left * state.light, left * state.weights).above(LEAST_WEIGHT)
         cells = table_of(grid, old, settings.capacity, device)
-        new = add_pass(scene, settings, cells, [frame.camera], 0, refresh.refresh, frame.seed, device)
-        sums = still_valid(old, new) + new
+        sums, done = old, 0
+        for _ in range(1 + MORE_PASSES):
+            cells = table_of(grid, sums, settings.capacity, device)
+            new = add_pass(scene, settings, cells, [frame.camera], done, refresh.refresh, frame.seed, device)
+            if done == 0:
+                old = still_valid(old, new)
+                is_another = old.counts.sum() < (1.0 - MUCH_CHANGED) * sums.counts.sum()
+            sums, done = old + new, done + refresh.refresh
+            if not is_another:
+                break
     cells = table_of(grid, sums, settings.capacity, device)
     here = np.array([frame.index])
     return replace(state, cells=cells, keys=sums.keys, light=sums.light, weights=sums.counts, frame=here)
 
 
 def still_valid(old: Sums, new: Sums) -> Sums:
-    """Return what was known before a frame, of less weight where the frame's samples say that the light is another.
+    """Return what was known before a frame, but for where the frame's samples say that the light is another.
 
     In every large cell each sample is compared with the mean of its own small cell, as the camera may look at other
     parts of it now. Of n differences d around 0 the sum has a variance of about that of d times n, by the samples
@@ -104,14 +114,13 @@ def still_valid(old: Sums, new: Sums) -> Sums:
     spread = np.maximum(old.light[by, 6] / weight - mean**2, 0.0) / weight
     difference = sums - count * mean
     variance = np.maximum(new.light[at, 6] - 2 * mean * sums + count * mean**2, 0.0) + count**2 * spread
-    around, every = new.keys[at], old.keys
-    for _ in range(CHANGE_LEVELS):
+    light = np.maximum(sums, count * mean)
+    is_valid, around, every = np.ones(len(old.keys), bool), new.keys[at], old.keys
+    for level in range(1, max(LEAST_CHANGE) + 1):
         around, every = coarser(around), coarser(every)
-    names, group = np.unique(around, return_inverse=True)
-    difference, variance, light = (
-        np.bincount(group, values) for values in (difference, variance, np.maximum(sums, count * mean))
-    )
-    is_sure = np.abs(difference) > LEAST_ERRORS * np.sqrt(variance)
-    changed = names[is_sure & (np.abs(difference) > LEAST_CHANGE * light)]
-    factor = np.where(np.isin(every, changed), CHANGED, 1.0)
-    return Sums(old.keys, old.light * factor[:, None], old.counts * factor)
+        if level in LEAST_CHANGE:
+            names, group = np.unique(around, return_inverse=True)
+            d, v, most = (np.bincount(group, values) for values in (difference, variance, light))
+            is_changed = (np.abs(d) > LEAST_ERRORS * np.sqrt(v)) & (np.abs(d) > LEAST_CHANGE[level] * most)
+            is_valid &= ~np.isin(every, names[is_changed])
+    return Sums(old.keys[is_valid], old.light[is_valid], old.counts[is_valid])
