@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 LEAST_LEFT = 0.1
 """Share of the samples' weight below which what is left of earlier frames is dropped, and all cells are filled anew."""
-LEAST_WEIGHT = 0.05
+LEAST_WEIGHT = 0.3
 """Weight of a cell's samples, in samples, below which it is forgotten."""
 LEAST_ERRORS = 3.0
 """Standard errors of the difference that a change of the light makes, at least."""
@@ -48,6 +48,8 @@ class CacheState:
     """Sums of the samples' weights, float64 [cell]."""
     frame: np.ndarray = field(default_factory=lambda: np.array([-1]))
     """Number of the frame that the cells are of, int64 [1]; -1 before the first one."""
+    tabled: int = field(default=-1, metadata={"derived": True})
+    """Number of the frame that the table of ``cells`` is of: another one in a state that was loaded from a file."""
 
 
 @dataclass(frozen=True)
@@ -82,11 +84,16 @@ def followed(frame: Frame, state: CacheState, settings: FillSettings, refresh: R
         sums, _ = fill(scene, settings, grid, [frame.camera], device, frame.seed)
         sums = Sums(sums.keys, sums.light, sums.counts.astype(np.float64))
     else:
+        cells = launch.copied(state.cells, SurfaceCells)
+        cells.objects = grid.objects
+        if state.tabled != last:
+            cells = table_of(grid, Sums(state.keys, state.light, state.weights), settings.capacity, device)
         old = Sums(state.keys, left * state.light, left * state.weights).above(LEAST_WEIGHT)
         cells = table_of(grid, old, settings.capacity, device)
         sums, done = old, 0
-        for _ in range(1 + MORE_PASSES):
-            cells = table_of(grid, sums, settings.capacity, device)
+        for number in range(1 + MORE_PASSES):
+            if number > 0:
+                cells = table_of(grid, sums, settings.capacity, device)
             new = add_pass(scene, settings, cells, [frame.camera], done, refresh.refresh, frame.seed, device)
             if done == 0:
                 old = still_valid(old, new)
@@ -96,7 +103,9 @@ def followed(frame: Frame, state: CacheState, settings: FillSettings, refresh: R
                 break
     cells = table_of(grid, sums, settings.capacity, device)
     here = np.array([frame.index])
-    return replace(state, cells=cells, keys=sums.keys, light=sums.light, weights=sums.counts, frame=here)
+    return replace(
+        state, cells=cells, keys=sums.keys, light=sums.light, weights=sums.counts, frame=here, tabled=frame.index
+    )
 
 
 def still_valid(old: Sums, new: Sums) -> Sums:
