@@ -11,7 +11,7 @@ from truth_tools import camera_in_box, closed_box, scene_of
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.errors import BakeError, OptionError, SceneError
+from warp_gi.errors import BakeError, OptionError
 from warp_gi.kernels.surface_cache_fill import fill_cells
 from warp_gi.techniques.surface_cache import fill
 
@@ -277,18 +277,6 @@ def test_a_full_cache_says_so_and_keeps_what_was_sampled_most():
     assert bake.arrays["cells"][:, 3].min() > np.median(whole[:, 3])
 
 
-def test_what_moves_is_refused():
-    keys = [gi.Keyframe(time, (time, 0.0, 0.0)) for time in (0.0, 1.0)]
-    moving = gi.Scene([gi.Node("room", closed_box(0.5, 1.0)), gi.Node("crate", closed_box(0.5, 0.0), keyframes=keys)])
-    for render in (lambda: baked(moving, camera_in_box()), lambda: indirect(moving, camera_in_box(), ending())):
-        with pytest.raises(SceneError, match="of a scene at rest, and here 'crate' moves; take indirect=BsdfPaths"):
-            render()
-    scene, camera = cornell(8, 8)
-    scene.environment = gi.TurningSky(gi.Environment(color=(1.0, 1.0, 1.0)), 9.0)
-    with pytest.raises(SceneError, match="and here the sky changes over time"):
-        indirect(scene, camera, ending())
-
-
 def test_a_fill_needs_a_camera():
     scene = scene_of(*closed_box(0.5, 1.0))
     with pytest.raises(OptionError, match="no camera is known: give a camera"):
@@ -303,6 +291,8 @@ def test_a_fill_needs_a_camera():
         ({"vertices": 65}, "vertices must be a whole number from 1 to 64"),
         ({"cell": -1.0}, "cell must be finite and not negative, got -1"),
         ({"growth": float("nan")}, "growth must be finite"),
+        ({"refresh": 999}, "refresh must be a whole number from 1000 to"),
+        ({"memory": 1.0}, "memory must be a weight from 0 to 0.99, got 1.0"),
         ({"traced_below": 1.5}, "traced_below must be a roughness from 0 to 1, got 1.5"),
     ],
 )

@@ -21,12 +21,13 @@ LOW, SIDE, GROWTH = np.array([-3.0, -1.0, -2.0]), 0.25, 0.05
 BOXES = np.array([[[0, 0, 0], [1, 1, 1]], [[9, 0, 0], [9, 0, 0]]], np.float32)
 
 
-# Thread: a point. Writes the key of its smallest cell and those of the levels above, the level, the first slot of the
-# key in a table of 2^10, and the slot in which the cell is.
+# Thread: a point of an object. Writes the key of its smallest cell and those of the levels above, the level, the first
+# slot of the key in a table of 2^10, and the slot in which the cell is.
 @wp.kernel
 def look_up(
     first: wp.int32,
     cells: kernels.SurfaceCells,
+    grid: kernels.ObjectGrid,
     positions: wp.array(dtype=wp.vec3),
     normals: wp.array(dtype=wp.vec3),
     keys: wp.array2d(dtype=wp.uint64),
@@ -35,7 +36,7 @@ def look_up(
 ):
     i = first + wp.tid()
     levels[i] = kernels.cell_level(cells, positions[i])
-    keys[i, 0] = kernels.cell_key(cells, positions[i], normals[i], levels[i])
+    keys[i, 0] = kernels.cell_key(cells, grid, positions[i], normals[i], levels[i])
     keys[i, 1] = kernels.coarser_key(keys[i, 0])
     keys[i, 2] = kernels.coarser_key(keys[i, 1])
     slots[i, 0] = kernels.first_slot(keys[i, 0], 10)
@@ -62,15 +63,24 @@ def read_from(
     known[i] = found.validity
 
 
-def looked_up(positions: np.ndarray, normals: np.ndarray, known: np.ndarray, rows: np.ndarray | None = None):
-    """Return keys, levels and slots of points in a table that holds the cells ``known``."""
+def looked_up(
+    positions: np.ndarray,
+    normals: np.ndarray,
+    known: np.ndarray,
+    rows: np.ndarray | None = None,
+    number: int = 0,
+    rest: np.ndarray | None = None,
+):
+    """Return keys, levels and slots of points in a table that holds the cells ``known``, of grid ``number``."""
     count, device = len(positions), st.device()
     rows = np.zeros((len(known), 8), np.float32) if rows is None else rows
     cells = with_table(grid_at(LOW, SIDE, GROWTH, BOXES, device), known, rows, device)
     keys = wp.zeros((count, 3), dtype=wp.uint64, device=device)
     levels, slots = wp.zeros(count, dtype=wp.int32, device=device), wp.zeros((count, 2), dtype=wp.int32, device=device)
     points, sides = (wp.array(a.astype(np.float32), dtype=wp.vec3, device=device) for a in (positions, normals))
-    launch.launch(look_up, count, [cells, points, sides, keys, levels, slots], device)
+    grid = kernels.ObjectGrid()
+    grid.number, grid.rest_from_world = number, wp.mat44(*(np.eye(4) if rest is None else rest).ravel().tolist())
+    launch.launch(look_up, count, [cells, grid, points, sides, keys, levels, slots], device)
     return keys.numpy(), levels.numpy(), slots.numpy(), cells
 
 
@@ -89,11 +99,11 @@ def level_of(position: np.ndarray) -> int:
     return level
 
 
-def key_of(position: np.ndarray, normal: np.ndarray, level: int) -> int:
-    """Return the key by floors, axis and level: 19 bits a coordinate, 3 of the side, 4 of the level + 1."""
+def key_of(position: np.ndarray, normal: np.ndarray, level: int, number: int = 0) -> int:
+    """Return the key by floors, axis and level: 9 bits of the grid, 16 a coordinate, 3 of the side, 4 of level + 1."""
     axis = int(np.argmax(np.abs(normal)))
     x, y, z = (int(np.floor((p - low) / (SIDE * 2**level))) for p, low in zip(position, LOW, strict=True))
-    return x << 45 | y << 26 | z << 7 | (2 * axis + int(normal[axis] < 0)) << 4 | level + 1
+    return number << 55 | x << 39 | y << 23 | z << 7 | (2 * axis + int(normal[axis] < 0)) << 4 | level + 1
 
 
 def test_keys_are_floors_axis_and_level():
@@ -112,11 +122,31 @@ def test_keys_are_floors_axis_and_level():
     assert (slots[:, 1] == -1).all()  # none is known
 
 
-def test_coordinates_end_at_19_bits():
+@pytest.mark.parametrize("number", [1, 511])
+def test_a_moved_object_keeps_its_cells(number):
+    """Keys are of the point and normal at rest; the level is that of the place now, as the camera sees it."""
+    positions, normals = some_points(1000)
+    positions = positions.astype(np.float32).astype(np.float64)
+    turn = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])  # a quarter: floats round nothing
+    move = np.eye(4)
+    move[:3, 3] = (16.0, 8.0, 64.0)
+    rest = move @ turn
+    keys, levels, _, _ = looked_up(positions, normals, np.zeros(0, np.uint64), number=number, rest=rest)
+    there, facing = positions @ rest[:3, :3].T + rest[:3, 3], normals @ rest[:3, :3].T
+    inside = (there > LOW).all(axis=1)
+    assert inside.sum() > 300
+    for k in range(2):
+        wanted = [key_of(p, n, int(level) + k, number) for p, n, level in zip(there, facing, levels, strict=True)]
+        np.testing.assert_array_equal(keys[inside, k], np.array(wanted, object)[inside].astype(np.uint64))
+    np.testing.assert_array_equal(coarser(keys[:, 0]), keys[:, 1])
+    np.testing.assert_array_equal(levels, [level_of(p) for p in positions])
+
+
+def test_coordinates_end_at_16_bits():
     far = np.array([[1e9, -1e9, 0.0]])
     key = int(looked_up(far, np.array([[0.0, 0, 1]]), np.zeros(0, np.uint64))[0][0, 0])
     level = (key & 15) - 1
-    assert key >> 45 == ((1 << 19) - 1) >> level and key >> 26 & ((1 << 19) - 1) == 0
+    assert key >> 39 == ((1 << 16) - 1) >> level and key >> 23 & ((1 << 16) - 1) == 0
 
 
 def test_every_known_cell_is_found_and_no_other():
@@ -154,7 +184,7 @@ def test_sums_by_key_and_level():
     positions, normals = some_points(900)
     positions[:, :] = LOW + (positions - LOW) * 0.05
     keys = looked_up(positions, normals, np.zeros(0, np.uint64))[0][:, 0]
-    light = random.random((len(keys), 6)).astype(np.float32)
+    light = random.random((len(keys), 7)).astype(np.float32)
     keys[:7], light[9, 2] = 0, np.nan
     expected: dict[int, list[np.ndarray]] = {}
     for key, row in zip(keys, light, strict=True):
@@ -199,7 +229,7 @@ def test_a_table_is_as_large_as_it_says():
 
 @pytest.mark.parametrize(("capacity", "kept", "over"), [(9, [3, 4, 6], 0), (2, [3, 6], 1)])
 def test_cells_with_few_samples_are_left_out(capacity, kept, over):
-    sums = Sums(np.arange(1, 7, dtype=np.uint64), np.ones((6, 6)), np.array([1, 3, 9, 4, 2, 5]))
+    sums = Sums(np.arange(1, 7, dtype=np.uint64), np.ones((6, 7)), np.array([1, 3, 9, 4, 2, 5]))
     found, without = sums.most_sampled(capacity)
     assert list(found.keys) == kept and without == over
     np.testing.assert_allclose(found.means()[:, 3], sums.counts[np.array(kept) - 1])
