@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -82,30 +82,25 @@ def followed(frame: Frame, state: CacheState, settings: FillSettings, refresh: R
     left = refresh.memory ** abs(frame.index - last) if last >= 0 else 0.0
     if left < LEAST_LEFT:
         sums, _ = fill(scene, settings, grid, [frame.camera], device, frame.seed)
-        sums = Sums(sums.keys, sums.light, sums.counts.astype(np.float64))
     else:
-        cells = launch.copied(state.cells, SurfaceCells)
-        cells.objects = grid.objects
-        if state.tabled != last:
-            cells = table_of(grid, Sums(state.keys, state.light, state.weights), settings.capacity, device)
-        old = Sums(state.keys, left * state.light, left * state.weights).above(LEAST_WEIGHT)
-        cells = table_of(grid, old, settings.capacity, device)
-        sums, done = old, 0
-        for number in range(1 + MORE_PASSES):
-            if number > 0:
-                cells = table_of(grid, sums, settings.capacity, device)
-            new = add_pass(scene, settings, cells, [frame.camera], done, refresh.refresh, frame.seed, device)
-            if done == 0:
-                old = still_valid(old, new)
-                is_another = old.counts.sum() < (1.0 - MUCH_CHANGED) * sums.counts.sum()
-            sums, done = old + new, done + refresh.refresh
-            if not is_another:
-                break
+        known = Sums(state.keys, state.light, state.weights)
+        if state.tabled == last:
+            cells = launch.copied(state.cells, SurfaceCells)
+            cells.objects = grid.objects
+        else:
+            cells = table_of(grid, known, settings.capacity, device)
+        known = Sums(state.keys, left * state.light, left * state.weights).above(LEAST_WEIGHT)
+        new = add_pass(scene, settings, cells, [frame.camera], 0, refresh.refresh, frame.seed, device)
+        valid = still_valid(known, new)
+        sums = valid + new
+        if valid.counts.sum() < (1.0 - MUCH_CHANGED) * known.counts.sum():
+            for number in range(1, 1 + MORE_PASSES):
+                cells, done = table_of(grid, sums, settings.capacity, device), number * refresh.refresh
+                sums = valid + add_pass(
+                    scene, settings, cells, [frame.camera], done, refresh.refresh, frame.seed, device
+                )
     cells = table_of(grid, sums, settings.capacity, device)
-    here = np.array([frame.index])
-    return replace(
-        state, cells=cells, keys=sums.keys, light=sums.light, weights=sums.counts, frame=here, tabled=frame.index
-    )
+    return CacheState(cells, True, sums.keys, sums.light, 1.0 * sums.counts, np.array([frame.index]), frame.index)
 
 
 def still_valid(old: Sums, new: Sums) -> Sums:
