@@ -14,10 +14,11 @@ import warp as wp
 
 from warp_gi.kernels.bsdf import Bsdf, diffuse_share, lambert
 from warp_gi.kernels.bvh import BvhHit, bvh_intersect
-from warp_gi.kernels.emitters import triangle_light_pdf
+from warp_gi.kernels.emitters import LightChoice, triangle_light_pdf
 from warp_gi.kernels.environment import environment_lookup, environment_sample
 from warp_gi.kernels.gbuffer import CameraData, camera_ray
 from warp_gi.kernels.light_connections import connect_emitter, connect_sky, light_1d, light_2d
+from warp_gi.kernels.light_hierarchy import LightTree, hierarchy_light, hierarchy_light_pdf
 from warp_gi.kernels.ltc import LtcTable, lobe_albedo
 from warp_gi.kernels.path_samplers import AliasLights, alias_light, alias_light_pdf
 from warp_gi.kernels.sampling import (
@@ -59,6 +60,8 @@ class FillSettings:
     index: wp.uint32  # of the random numbers of the first path of the pass
     seed: wp.uint32
     vertices: wp.int32  # of a path
+    by_tree: wp.int32  # 1: emitters are selected by `tree`, 0: by power
+    tree: LightTree
 
 
 # One record for each vertex, [path * FillSettings.vertices]. The path's thread writes them.
@@ -91,21 +94,40 @@ def lobe_reflectance(table: LtcTable, b: Bsdf, cosine: wp.float32) -> wp.vec3:
     return b.f0 * a[0] + wp.vec3(offset, offset, offset)
 
 
+# An emitter, for the point of a white surface.
+@wp.func
+def fill_light(settings: FillSettings, scene: SceneData, white: Surface, wo: wp.vec3, u: wp.vec2) -> LightChoice:
+    if settings.by_tree != 0:
+        return hierarchy_light(settings.tree, scene, -1, white, wo, u)
+    return alias_light(AliasLights(), scene, -1, white, wo, u)
+
+
+# Probability of selecting it.
+@wp.func
+def fill_light_pdf(
+    settings: FillSettings, scene: SceneData, white: Surface, wo: wp.vec3, emitter: wp.int32
+) -> wp.float32:
+    if settings.by_tree != 0:
+        return hierarchy_light_pdf(settings.tree, scene, -1, white, wo, emitter)
+    return alias_light_pdf(AliasLights(), scene, -1, white, wo, emitter)
+
+
 # Irradiance [W/m^2] by one sample of the sky and one of an emitter, added to a step. `white` is the surface `s` with
-# the BSDF 1 / pi; index, seed and dimension are those of the vertex.
+# the BSDF 1 / pi; index and dimension are those of the vertex.
 @wp.func
 def add_lights(
     step: FillStep,
     scene: SceneData,
     table: LtcTable,
+    settings: FillSettings,
     s: Surface,
     white: Surface,
     wo: wp.vec3,
     index: wp.uint32,
-    seed: wp.uint32,
     d: wp.int32,
 ) -> FillStep:
     r = step
+    seed = settings.seed
     if scene.environment.kind == ENVIRONMENT_MAP:
         u = light_2d(index, seed, d + SKY_DIMENSION, False)
         digits = random_1d(index, seed, d + SKY_DIGITS_DIMENSION)
@@ -118,7 +140,7 @@ def add_lights(
     if scene.emitters.count > 0:
         first = light_1d(index, seed, d + LIGHT_DIMENSION, False)
         u_choice = wp.vec2(first, random_1d(index, seed, d + LIGHT_DIMENSION))
-        choice = alias_light(AliasLights(), scene, -1, white, wo, u_choice)
+        choice = fill_light(settings, scene, white, wo, u_choice)
         sample = connect_emitter(scene, white, wo, choice, light_2d(index, seed, d + EMITTER_DIMENSION, False))
         if sample.arrives > 0:
             light = sample.reflected * wp.pi
@@ -132,7 +154,15 @@ def add_lights(
 
 # Irradiance by what the way on meets of sky and emitters, weighed against the samples of `add_lights`.
 @wp.func
-def met_light(scene: SceneData, white: Surface, wo: wp.vec3, wi: wp.vec3, pdf: wp.float32, hit: BvhHit) -> wp.vec3:
+def met_light(
+    scene: SceneData,
+    settings: FillSettings,
+    white: Surface,
+    wo: wp.vec3,
+    wi: wp.vec3,
+    pdf: wp.float32,
+    hit: BvhHit,
+) -> wp.vec3:
     if hit.face < 0:
         if scene.environment.kind == ENVIRONMENT_NONE:
             return wp.vec3(0.0, 0.0, 0.0)
@@ -143,28 +173,33 @@ def met_light(scene: SceneData, white: Surface, wo: wp.vec3, wi: wp.vec3, pdf: w
     emitter = scene.geometry.emitters[hit.face]
     if emitter < 0:
         return wp.vec3(0.0, 0.0, 0.0)
-    light_pdf = triangle_light_pdf(scene, hit.face, wi, hit.t) * alias_light_pdf(
-        AliasLights(), scene, -1, white, wo, emitter
-    )
+    light_pdf = triangle_light_pdf(scene, hit.face, wi, hit.t)
+    light_pdf = light_pdf * fill_light_pdf(settings, scene, white, wo, emitter)
     return surface_emission(scene, hit.face, hit.u, hit.v, -wi) * (wp.pi * balance(pdf, light_pdf))
 
 
 @wp.func
 def fill_step(
-    scene: SceneData, table: LtcTable, s: Surface, view: wp.vec3, index: wp.uint32, seed: wp.uint32, d: wp.int32
+    scene: SceneData,
+    table: LtcTable,
+    settings: FillSettings,
+    s: Surface,
+    view: wp.vec3,
+    index: wp.uint32,
+    d: wp.int32,
 ) -> FillStep:
     r = FillStep()
     r.hit.face = -1
     white = s
     white.bsdf = lambert(wp.vec3(1.0, 1.0, 1.0))
     wo = wp.transpose(s.shading) * view
-    r = add_lights(r, scene, table, s, white, wo, index, seed, d)
-    local = cosine_direction(sample_2d(index, seed, d + DIRECTION_DIMENSION + 1))
+    r = add_lights(r, scene, table, settings, s, white, wo, index, d)
+    local = cosine_direction(sample_2d(index, settings.seed, d + DIRECTION_DIMENSION + 1))
     r.direction = s.shading * local
     if local[2] > 0.0 and wp.dot(r.direction, s.normal) > 0.0:
         r.rho = lobe_reflectance(table, s.bsdf, local[2])
         r.hit = bvh_intersect(scene.bvh, ray_origin(s), r.direction, float(wp.inf))
-        light = met_light(scene, white, wo, r.direction, local[2] / wp.pi, r.hit)
+        light = met_light(scene, settings, white, wo, r.direction, local[2] / wp.pi, r.hit)
         r.irradiance = r.irradiance + light
         r.exitance = r.exitance + wp.cw_mul(r.rho, light)
     return r
@@ -193,7 +228,7 @@ def fill_cells(
     while hit.face >= 0 and met < settings.vertices:
         s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
         d = PATH_DIMENSION + met * VERTEX_DIMENSIONS
-        step = fill_step(scene, table, s, -direction, index, settings.seed, d)
+        step = fill_step(scene, table, settings, s, -direction, index, d)
         at = start + met
         grid = object_grid(cells, scene, hit.face)
         records.keys[at] = cell_key(cells, grid, s.position, s.normal, cell_level(cells, s.position))

@@ -111,6 +111,27 @@ def test_both_sides_of_a_sheet():
     np.testing.assert_allclose(light[~below], np.tile([3.0, 2.0, 1.0], ((~below).sum(), 1)), rtol=1e-5)
 
 
+def test_cells_under_many_lamps_hold_the_sum_of_their_light():
+    """A black floor under sixty lamps, a few of which matter at each point: a sum in float64 at each cell's middle."""
+    random = np.random.default_rng(8)
+    places, powers = random.uniform([-4, 0.4, -4], [4, 1.5, 4], (60, 3)), random.uniform(0.1, 3.0, 60)
+    lamps = [gi.PunctualLight("point", (i, i, i), tuple(p)) for p, i in zip(places, powers, strict=True)]
+    floor = quad((-4, 0, 4), (8, 0, 0), (0, 0, -8), gi.Material("black", (0, 0, 0), specular=0.0))
+    camera = gi.Camera.look_at((0, 9, 0.1), (0, 0, 0), hfov=60)
+    bake = baked(scene_of(floor, lights=lamps), camera, gi.SurfaceCache(paths=60_000, cell=0.1, growth=0.0))
+    keys, rows = bake.arrays["keys"], bake.arrays["cells"]
+    smallest = (keys & np.uint64(15)) == 1
+    x, z = (keys[smallest] >> np.uint64(shift) & np.uint64(0xFFFF) for shift in (39, 7))
+    at = np.stack([x + 0.5, np.full(len(x), np.nan), z + 0.5], axis=1) * 0.1 + bake.arrays["low"]
+    at[:, 1] = 0.0
+    to = places - at[:, None]
+    wanted = (powers * to[..., 1] / np.linalg.norm(to, axis=2) ** 3).sum(axis=1)
+    found = rows[smallest, 0]
+    assert len(found) > 3000
+    assert found.sum() == pytest.approx(wanted.sum(), rel=0.01)
+    assert np.sqrt(((found - wanted) ** 2).mean()) < 0.2 * wanted.mean()  # 0.96 by power alone
+
+
 @pytest.mark.parametrize("settings", [{}, {"capacity": 2000}, {"paths": 2000}])
 @pytest.mark.filterwarnings("ignore:the surface cache is full")
 def test_thin_walls_keep_light_in(settings):

@@ -13,10 +13,12 @@ from warp_gi.baking import Setting
 from warp_gi.color import LUMINANCE
 from warp_gi.kernels import surface_cache_fill as kernels
 from warp_gi.kernels.gbuffer import CameraData
+from warp_gi.kernels.light_hierarchy import LightTree
 from warp_gi.kernels.surface_cache import LARGEST_COORDINATE, MOST_OBJECTS, ObjectGrid, SurfaceCells
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.pinhole import camera_data
 from warp_gi.scene.scene import Scene
+from warp_gi.techniques.light_hierarchy.estimator import LightHierarchy
 from warp_gi.techniques.shared.lamps import lit_data
 from warp_gi.techniques.shared.ltc import ltc_table
 from warp_gi.techniques.surface_cache.cells import NOTHING, Sums, with_table
@@ -83,11 +85,11 @@ def fill(
     left = max(settings.paths - sum(first), settings.paths // 2)
     counts = [*first, *(left * (k + 1) // LATER_PASSES - left * k // LATER_PASSES for k in range(LATER_PASSES))]
     longer = replace(settings, vertices=settings.vertices * FIRST_VERTICES)
-    total, vertices, done = NOTHING, 0, 0
+    total, vertices, done, lights = NOTHING, 0, 0, fill_lights(scene, device)
     for number, count in enumerate(counts):
         cells = table_of(grid, total, settings.capacity, device)
         chosen = longer if number < FIRST_PASSES else settings
-        found = add_pass(scene, chosen, cells, cameras, done, count, seed, device)
+        found = add_pass(scene, chosen, cells, cameras, done, count, seed, device, lights)
         vertices += int(found.counts.sum())
         if number < FIRST_PASSES:
             total = found + total.without(found)
@@ -97,6 +99,12 @@ def fill(
         if progress is not None:
             progress(done / sum(counts))
     return total, vertices
+
+
+def fill_lights(scene: Scene, device: wp.Device) -> LightTree | None:
+    """Return the hierarchy over a scene's lights in their pose now; None where they are picked by power."""
+    state = LightHierarchy().start(scene, device.alias)
+    return None if state is None else state.data
 
 
 def table_of(grid: SurfaceCells, sums: Sums, capacity: int, device: wp.Device) -> SurfaceCells:
@@ -114,15 +122,18 @@ def add_pass(
     count: int,
     seed: int,
     device: wp.Device,
+    lights: LightTree | None,
 ) -> Sums:
     """Return the sums of a pass of ``count`` paths, whose random numbers come after those of ``done`` others.
 
-    The scene is seen in its pose now. Behind their last vertices paths read ``cells``.
+    The scene is seen in its pose now. Behind their last vertices paths read ``cells``; ``lights`` are ``fill_lights``.
     """
     total = NOTHING
     query, data, table = kernels.FillSettings(), lit_data(scene, device), ltc_table(device)
     query.cameras = wp.array([camera_data(camera) for camera in cameras], dtype=CameraData, device=device)
     query.pass_paths, query.index = count, done & 0xFFFFFFFF
+    if lights is not None:
+        query.by_tree, query.tree = 1, lights
     query.seed, query.vertices = seed & 0xFFFFFFFF, settings.vertices
     most = max(LAUNCH_RECORDS // settings.vertices, 1)
     for start in range(0, count, most):

@@ -13,7 +13,7 @@ from warp_gi.frame import Frame
 from warp_gi.kernels.surface_cache import SurfaceCells
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.techniques.surface_cache.cells import NOTHING, Sums, coarser
-from warp_gi.techniques.surface_cache.fill import FillSettings, add_pass, fill, object_grids, table_of
+from warp_gi.techniques.surface_cache.fill import FillSettings, add_pass, fill, fill_lights, object_grids, table_of
 
 if TYPE_CHECKING:
     from warp_gi.scene.scene import Scene
@@ -90,14 +90,15 @@ def followed(frame: Frame, state: CacheState, settings: FillSettings, refresh: R
         else:
             cells = table_of(grid, known, settings.capacity, device)
         known = Sums(state.keys, left * state.light, left * state.weights).above(LEAST_WEIGHT)
-        new = add_pass(scene, settings, cells, [frame.camera], 0, refresh.refresh, frame.seed, device)
+        lights = fill_lights(scene, device)
+        new = add_pass(scene, settings, cells, [frame.camera], 0, refresh.refresh, frame.seed, device, lights)
         valid = still_valid(known, new)
         sums = valid + new
         if valid.counts.sum() < (1.0 - MUCH_CHANGED) * known.counts.sum():
             for number in range(1, 1 + MORE_PASSES):
                 cells, done = table_of(grid, sums, settings.capacity, device), number * refresh.refresh
                 sums = valid + add_pass(
-                    scene, settings, cells, [frame.camera], done, refresh.refresh, frame.seed, device
+                    scene, settings, cells, [frame.camera], done, refresh.refresh, frame.seed, device, lights
                 )
     cells = table_of(grid, sums, settings.capacity, device)
     return CacheState(cells, True, sums.keys, sums.light, 1.0 * sums.counts, np.array([frame.index]), frame.index)
