@@ -26,8 +26,8 @@ def errors(pictures: Pictures, name: str, true: np.ndarray | None = None) -> Row
     """Return RMSE, relMSE and FLIP of one picture by a renderer, and how many pixels are NaN or infinite in any.
 
     RMSE and relMSE are of the variance over its own pictures, which is its error as it has no bias; those pixels make
-    them NaN. relMSE is over ``true`` squared, float [height, width, 3], or the mean of all; FLIP is the first picture's,
-    against the mean of all others.
+    them NaN. relMSE is over ``true`` squared, float [height, width, 3], or over the mean of all. FLIP is the first
+    picture's, against the mean of all others.
     """
     own, count = np.asarray(pictures[name], np.float64), sum(len(group) for group in pictures.values())
     with np.errstate(invalid="ignore"):  # pixels that are bad make it NaN
