@@ -27,8 +27,8 @@ _SCENES = (
 _LLVM, _SCALAR = "mitsuba llvm_ad_rgb", "mitsuba scalar_rgb"
 
 
-def _seconds(renderer: str) -> Figure:
-    return Figure("wall s", {"renderer": renderer}, table="equal samples")
+def _seconds(renderer: str, kind: str = "wall s") -> Figure:
+    return Figure(kind, {"renderer": renderer}, table="equal samples")
 
 
 def _off_reference(renderer: str) -> Figure:
@@ -76,8 +76,8 @@ _PATH = Region(
             "picture, all light",
             {case: {"case": case} for case in _SCENES},
             (
-                GridColumn("ours, s", _seconds("ours")),
-                GridColumn("Mitsuba LLVM, s", _seconds(_LLVM)),
+                GridColumn("ours, CPU s", _seconds("ours", "cpu s")),
+                GridColumn("Mitsuba LLVM, CPU s", _seconds(_LLVM, "cpu s")),
                 GridColumn("our squared error over its", Figure("error ratio", at_most=1.0)),
                 _faster("faster, CPU", "faster, cpu", _LLVM),
                 _faster("at equal error, CPU", "faster at equal error, cpu", _LLVM),
