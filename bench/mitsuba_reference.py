@@ -47,6 +47,8 @@ PICTURES: dict[str, Picture] = {
     "living_room_lamp": Picture("living_room", materials=LAMBERT, max_depth=5, peer_error=0.003),
     "spheres_lamp": Picture("spheres", materials=PLAIN, max_depth=5),
     "spheres_interior": Picture("spheres_interior", materials=PLAIN, max_depth=5),
+    "lamp_wall": Picture("lamp_wall", materials=PLAIN),
+    "white_room": Picture("white_room", materials=LAMBERT, max_depth=5),
 }
 """Pictures by the names of their files."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -121,16 +121,20 @@ def computed(
     spp: int,
     moment: int = 0,
     centred: bool = False,
+    emitters: gi.Estimator | None = None,
     told: Callable[[float], None] = lambda share: None,
 ) -> Reference:
     """Return a reference by the path tracer with ``spp`` samples a pixel, half of them in each half.
 
-    ``centred`` sends rays through the middles of pixels, as pipelines with one sample do.
+    ``centred`` sends rays through the middles of pixels, as pipelines with one sample do. ``emitters`` samples the
+    emitters in place of the preset's estimator.
     """
     chunk = min(max(spp // 2, 1), CHUNK)
     count = max(round(spp / 2 / chunk), 1)
     indirect = gi.BsdfPaths(max_depth=REFERENCE_DEPTH)
     pipeline = gi.Pipeline.preset("path", spp=chunk, camera_samples=1 if centred else chunk, indirect=indirect)
+    if emitters is not None:
+        pipeline = replace(pipeline, emitters=emitters)
     compiled, started, halves = launch.compile_seconds, time.perf_counter(), []
     for half in range(2):
         frames = StillFrames(scene, camera, pipeline, device, seed + (half + 1) * _FAR, moment)

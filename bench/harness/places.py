@@ -99,6 +99,7 @@ _FLOOR = _still((8, 0.4, -0.8), (-6, 0.2, 1.5), 65.0)
 _WINDOWS = _still((0, 1, 4), (0.5, 1.2, 0), 60.0)
 _INTO_THE_ROOM = _still((0, 1.3, 1.2), (0.3, 1.1, 6), 60.0)
 _ROOFS = _still((-40, 45, -60), (-10, 0, -10), 60.0)
+_VEACH = _still((16.2155, 4.05167, 0.0115), (0.0, 3.9759, -0.07), 35.0, (540, 540))
 _ROW = _still((0, 1.6, 7), (0, 1.1, 0), 50.0)
 
 PLACES: dict[str, Place] = {
@@ -106,14 +107,18 @@ PLACES: dict[str, Place] = {
     "atrium": Place("atrium", "atrium"),
     "atrium_white": Place("atrium, white sky", "atrium", environment=WHITE),
     "cornell_box": Place("Cornell box", "cornell_box"),
+    "lamp_wall": Place("wall of lamps", "lamp_wall"),
     "mine": Place("mine", "mine"),
     "mine_spot": Place("mine, spot", "mine", "spot"),
+    "plates": Place("plates", "plates"),
+    "shaded_lamp": Place("lamps behind shades", "shaded_lamp"),
     "sphere_row": Place("sphere_row", "sphere_row", "main"),
     "street": Place("street", "street"),
     "street_white": Place("street, white sky", "street", environment=WHITE),
     "two_rooms": Place("two rooms, the lit one", "two_rooms"),
     "two_rooms_dark": Place("two rooms, the dark one", "two_rooms", _still((3.7, 1.7, 1.8), (1.2, 0.9, -1.2), 75.0)),
     "warehouse": Place("warehouse", "warehouse"),
+    "white_room": Place("white room", "white_room"),
     # built here
     "cylinders": Place("cylinders", scenes.cylinder_box, _still((0, 8.5, 0.01), (0, 0, 0), 42.0, (540, 540))),
     "guiding_ring": Place("guiding_ring", scenes.guiding_ring, _still((0, 6, 0.01), (0, 0, 0), 26.0, (540, 540))),
@@ -131,6 +136,7 @@ PLACES: dict[str, Place] = {
     "living_room": Place("living room", scenes.lit_room, _WINDOWS, reads=(scenes.LIVING_ROOM,)),
     "living_room_all": Place("living room, all", scenes.lit_room, _INTO_THE_ROOM, reads=(scenes.LIVING_ROOM,)),
     "living_room_white": Place("living room, white sky", scenes.LIVING_ROOM, _WINDOWS, WHITE),
+    "veach_bidir": Place("Veach's lamps", "veach_bidir.glb", _VEACH),
     "modern_hall": Place("modern hall", "modern_hall.glb", _still((4, 1.7, 2), (-3, 1.6, -0.5), 60.0)),
     "sponza": Place("Sponza", _SPONZA, _NAVE, WHITE),
     "sponza_courtyard": Place("Sponza, courtyard sky", _SPONZA, _NAVE, COURTYARD),

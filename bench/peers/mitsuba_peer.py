@@ -118,9 +118,18 @@ def _register(mi: Any) -> None:
             fresnel = f0 + (f90 - f0) * (1.0 - dr.clip(cos_d, 0.0, 1.0)) ** 5
             diffuse = dr.lerp(base, mi.Color3f(0.0), metallic)
             value = (1.0 - fresnel) * diffuse * dr.inv_pi + fresnel * (distribution.eval(half) * visible)
-            pdf = 0.5 * cos_o * dr.inv_pi + 0.5 * distribution.pdf(wi, half) / (4.0 * cos_d)
+            glossy = self._glossy(cos_i, base, metallic)
+            pdf = dr.lerp(cos_o * dr.inv_pi, distribution.pdf(wi, half) / (4.0 * cos_d), glossy)
             valid = active & (cos_i > 0.0) & (cos_o > 0.0)
             return dr.select(valid, value * cos_o, 0.0), dr.select(valid, pdf, 0.0)
+
+        def _glossy(self, cos_i: Any, base: Any, metallic: Any) -> Any:
+            """Return the probability of sampling the GGX lobe: its share of the reflectance, as our path tracer's."""
+            tail = (1.0 - dr.clip(cos_i, 0.0, 1.0)) ** 5
+            f0 = dr.lerp(mi.Color3f(0.04 * self.specular), base, metallic)
+            fresnel = mi.luminance(dr.lerp(f0, mi.Color3f(dr.lerp(self.specular, 1.0, metallic)), tail))
+            diffuse = mi.luminance(dr.lerp(base, mi.Color3f(0.0), metallic)) * (1.0 - fresnel)
+            return dr.select(diffuse > 0.0, dr.maximum(fresnel / (fresnel + diffuse), 0.05), 1.0)
 
         def _sides(self, si: Any, wo: Any) -> tuple[Any, Any]:
             side = dr.mulsign(mi.Float(1.0), mi.Frame3f.cos_theta(si.wi))
@@ -134,7 +143,8 @@ def _register(mi: Any) -> None:
             distribution = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True)
             normal, _ = distribution.sample(wi, sample2)
             reflected = normal * (2.0 * dr.dot(wi, normal)) - wi
-            glossy = sample1 < 0.5
+            base, metallic = self.base.eval(si, active), self.metallic.eval_1(si, active)
+            glossy = sample1 < self._glossy(mi.Frame3f.cos_theta(wi), base, metallic)
             wo = dr.select(glossy, reflected, mi.warp.square_to_cosine_hemisphere(sample2))
             value, pdf = self._value(wi, wo, si, active)
             bs = mi.BSDFSample3f()

@@ -22,11 +22,15 @@ from warp_gi.scene.builtin import textures as tx
 TRIANGLES = {
     "atrium": (140_000, 180_000),
     "cornell_box": (30, 60),
+    "lamp_wall": (15_000, 20_000),
     "mine": (60_000, 100_000),
+    "plates": (1_300, 1_400),
+    "shaded_lamp": (5_000, 15_000),
     "sphere_row": (10_000, 40_000),
     "street": (100_000, 150_000),
     "two_rooms": (500, 10_000),
     "warehouse": (20_000, 100_000),
+    "white_room": (2_000, 4_000),
 }
 
 CLOSED = {

@@ -1,6 +1,6 @@
 """Columns of the suite ``path``."""
 
-from warp_gi.bench.harness.columns import COUNT, ERROR, TIME, columns, keys, measured, ratios, seconds
+from warp_gi.bench.harness.columns import COUNT, ERROR, RATIO, TIME, columns, keys, measured, ratios, seconds
 
 COLUMNS = columns(
     "path",
@@ -10,9 +10,11 @@ COLUMNS = columns(
     ratios("faster, {}"),
     ratios("faster at equal error, {}"),
     measured(ERROR, "W/(m^2 sr)", "lower", "RMSE"),
-    measured(ERROR, "", "lower", "relMSE", "FLIP"),
+    measured(ERROR, "", "lower", "relMSE", "FLIP", "noise relMSE"),
     measured(ERROR, "times", "lower", "error ratio"),
     measured(ERROR, "pixels", "lower", "bad pixels"),
-    measured(ERROR, "share", None, "means differ"),
-    measured(COUNT, "samples", None, "samples a pixel"),
+    measured(ERROR, "share", None, "means differ", "standard error"),
+    measured(RATIO, "times", "higher", "least", "geometric mean", "most"),
+    measured(COUNT, "samples", None, "samples a pixel", "reference spp"),
+    measured(COUNT, "", None, "pictures"),
 )

@@ -18,11 +18,15 @@ if TYPE_CHECKING:
 BUILTIN_SCENES = {
     "atrium": "two storeys of arcades around a sunlit court, about 170K triangles",
     "cornell_box": "the classic test of colour bleeding, in a box of 2 m",
+    "lamp_wall": "a wall of 3,200 small lamps of many colours above a floor with objects",
     "mine": "a cavern and tunnels of rock, lit by a sun-lit spot below a shaft, about 80K triangles",
+    "plates": "four metal plates of rising roughness under four ball lamps of equal power, after Veach",
+    "shaded_lamp": "a closed room with two lamps whose shades hide their bulbs, so that nearly all light is indirect",
     "sphere_row": "metal spheres of rising roughness on a plane",
     "street": "houses with balconies and trees with many leaves, about 130K triangles",
     "two_rooms": "one lit and one dark room with a thin wall between them",
     "warehouse": "rooms of shelves under hundreds of lamps, most of them hidden from any one point",
+    "white_room": "a white room with one window under an overcast sky",
 }
 """Built-in scenes by name, with a line about each."""
 
