@@ -13,12 +13,12 @@ from warp_gi.scene.scene import Scene
 from warp_gi.techniques.bake_tool import BakeTool, Rows, Table, times
 from warp_gi.techniques.radiance_transfer import export as export_files
 from warp_gi.techniques.radiance_transfer import pictures
-from warp_gi.techniques.radiance_transfer.atlas import check_surfaces
-from warp_gi.techniques.radiance_transfer.densities import check_texel_sets
 from warp_gi.techniques.radiance_transfer.estimator import RadianceTransfer
 from warp_gi.techniques.radiance_transfer.pca import CHANNELS
 from warp_gi.techniques.radiance_transfer.textures import transfer_textures
 from warp_gi.techniques.radiance_transfer.viewer import page
+from warp_gi.techniques.shared.atlas.build import check_surfaces
+from warp_gi.techniques.shared.atlas.densities import check_texel_sets
 
 
 class RadianceTransferTool(BakeTool[RadianceTransfer]):

@@ -19,14 +19,16 @@ from warp_gi.baking import Bake
 from warp_gi.errors import OptionError
 from warp_gi.files import replacing
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.radiance_transfer.gltf_export import GENERATOR, glb
 from warp_gi.techniques.radiance_transfer.pca import CompressedBounces, compress_bounces
-from warp_gi.techniques.radiance_transfer.textures import LIGHT_NUMBERS, Atlas, TransferTextures, transfer_textures
+from warp_gi.techniques.radiance_transfer.textures import LIGHT_NUMBERS, TransferTextures, transfer_textures
+from warp_gi.techniques.shared.atlas.atlas import Atlas
+from warp_gi.techniques.shared.atlas.gltf import glb
 from warp_gi.techniques.shared.exports import check_own
 from warp_gi.techniques.shared.exr_parts import Part, write_exr_parts
 from warp_gi.techniques.shared.octahedral_atlas import warn_if_too_large
 
 FORMAT = "warp_gi transfer textures"
+"""What all files say that they are."""
 FORMAT_VERSION = 1
 SIDES = ("front", "back")
 MASK = ("Y",)
@@ -139,7 +141,7 @@ def _says_so(file: Path) -> bool:
         if file.suffix == ".glb":  # 12 bytes of header, then the length of the JSON chunk, its type and itself
             opened.seek(20)
             said = json.loads(opened.read(int.from_bytes(head[12:16], "little")))
-            return bool(said["asset"]["generator"] == GENERATOR)
+            return bool(said["asset"]["generator"] == FORMAT)
     return DIGEST.encode() in head
 
 
@@ -220,7 +222,7 @@ def export_textures(bake: Bake, path: str | Path, scene: Scene, components: int 
     files = exported_files(path)
     description = files.pop("description")
     digest = {DIGEST: bake.digest}
-    surfaces = glb(scene, textures.atlas)
+    surfaces = glb(scene, textures.atlas, FORMAT)
     with ExitStack() as stack:  # it renames in reverse: the description last
         text = stack.enter_context(replacing(description))
         parts = {name: stack.enter_context(replacing(file)) for name, file in files.items()}
