@@ -22,7 +22,7 @@ from warp_gi.scene.scene import Scene
 from warp_gi.techniques.radiance_transfer.pca import CompressedBounces, compress_bounces
 from warp_gi.techniques.radiance_transfer.textures import LIGHT_NUMBERS, TransferTextures, transfer_textures
 from warp_gi.techniques.shared.atlas.atlas import Atlas
-from warp_gi.techniques.shared.atlas.gltf import glb
+from warp_gi.techniques.shared.atlas.gltf import generator_of, glb
 from warp_gi.techniques.shared.exports import check_own
 from warp_gi.techniques.shared.exr_parts import Part, write_exr_parts
 from warp_gi.techniques.shared.octahedral_atlas import warn_if_too_large
@@ -136,13 +136,10 @@ def check_export_name(path: str | Path) -> None:
 def _says_so(file: Path) -> bool:
     if file.suffix == ".json":
         return bool(json.loads(file.read_text())["format"] == FORMAT)
+    if file.suffix == ".glb":
+        return generator_of(file) == FORMAT
     with open(file, "rb") as opened:
-        head = opened.read(HEAD)
-        if file.suffix == ".glb":  # 12 bytes of header, then the length of the JSON chunk, its type and itself
-            opened.seek(20)
-            said = json.loads(opened.read(int.from_bytes(head[12:16], "little")))
-            return bool(said["asset"]["generator"] == FORMAT)
-    return DIGEST.encode() in head
+        return DIGEST.encode() in opened.read(HEAD)
 
 
 def page_images(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pygltflib
@@ -119,6 +121,17 @@ def glb(scene: Scene, atlas: Atlas, generator: str, extras: dict[str, str] | Non
         document.meshes[-1].primitives.append(primitive)
     document.scenes = [pygltflib.Scene(name=scene.name, nodes=list(range(len(document.nodes))), extras=extras or {})]
     return writer.whole()
+
+
+def generator_of(file: Path) -> str:
+    """Return what a .glb or .gltf file says that it was made by. What a file that is none raises is any error."""
+    with open(file, "rb") as opened:
+        head = opened.read(20)  # the header, then the length of the JSON chunk and its type
+        if head[:4] == b"glTF":
+            said = json.loads(opened.read(int.from_bytes(head[12:16], "little")))
+        else:
+            said = json.loads(head + opened.read())
+    return str(said["asset"]["generator"])
 
 
 class _Writer:
