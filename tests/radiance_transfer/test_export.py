@@ -23,7 +23,7 @@ from warp_gi.techniques.radiance_transfer import export
 from warp_gi.techniques.radiance_transfer.textures import TransferTextures
 from warp_gi.techniques.radiance_transfer.transfer_file import read_export
 from warp_gi.techniques.radiance_transfer.vertices import vertex_atlas
-from warp_gi.techniques.shared.atlas.atlas import Atlas
+from warp_gi.techniques.shared.atlas.atlas import Atlas, page_coordinates
 from warp_gi.techniques.shared.atlas.gltf import drawn_triangles
 from warp_gi.techniques.shared.exr_parts import read_exr_parts
 
@@ -128,7 +128,7 @@ def test_the_reader_filters_as_kernels_do(exported, side):
     textures, path = exported
     faces, u, v = random_points(np.arange(len(textures.atlas.face_pages)), 20)
     file = read_export(path.with_suffix(".json"))
-    pages, uvs = export.page_coordinates(textures.atlas, faces, u, v)
+    pages, uvs = page_coordinates(textures.atlas, faces, u, v)
     found = file.irradiance(pages, uvs, LIGHT, side)
     wanted = directly(textures, faces, u, v, side, LIGHT)
     np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-3)
@@ -242,7 +242,7 @@ def test_components_are_exported(scene, tmp_path):
     part = next(part for part in info["parts"] if part["kind"] == "bounces")
     assert part["channels"] == [f"P.{i:02d}" for i in range(16)] and len(part["rgba_parts"]) == 4
     faces, u, v = random_points(np.arange(len(textures.atlas.face_pages)), 50)
-    pages, uvs = export.page_coordinates(textures.atlas, faces, u, v)
+    pages, uvs = page_coordinates(textures.atlas, faces, u, v)
     whole = tmp_path / "b.exr"
     export.export_textures(bake_of(textures, scene), whole, scene)
     light = LIGHT + np.eye(25)[0] * 8

@@ -64,7 +64,7 @@ def test_what_cannot_be_baked_or_exported(tmp_path, capsys):
         (["--everywhere"], "a surface cache is of what the camera path needs: omit it"),
         (
             ["--export", str(tmp_path / "a.obj")],
-            "cannot export to a.obj: expected .ply for the cells as points, or .glb",
+            "cannot export to a.obj: expected .ply for points, or .glb, .gltf or .exr",
         ),
         (["--vertices=0"], "vertices must be a whole number from 1 to 64, got 0"),
     ):

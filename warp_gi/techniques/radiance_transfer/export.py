@@ -21,7 +21,6 @@ from warp_gi.files import replacing
 from warp_gi.scene.scene import Scene
 from warp_gi.techniques.radiance_transfer.pca import CompressedBounces, compress_bounces
 from warp_gi.techniques.radiance_transfer.textures import LIGHT_NUMBERS, TransferTextures, transfer_textures
-from warp_gi.techniques.shared.atlas.atlas import Atlas
 from warp_gi.techniques.shared.atlas.gltf import generator_of, glb
 from warp_gi.techniques.shared.exports import check_own
 from warp_gi.techniques.shared.exr_parts import Part, write_exr_parts
@@ -183,17 +182,6 @@ def _image(values: np.ndarray, slots: np.ndarray, shape: tuple[int, int]) -> np.
     kept = slots >= 0
     image[kept] = values[slots[kept]]
     return image.reshape(*shape, -1)
-
-
-def page_coordinates(atlas: Atlas, faces: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where points (u, v) of faces are, each [point]: their page, and coordinates in it, float32 [point, 2].
-
-    They are those of ``TransferFile.irradiance``; page -1 where a face has none.
-    """
-    pages, corners = atlas.face_pages[faces], atlas.corners[faces]
-    weights = np.stack([1.0 - u - v, u, v], axis=-1)[..., None]
-    sizes = atlas.pages[np.maximum(pages, 0), 1:]
-    return pages, ((corners * weights).sum(axis=1) / sizes).astype(np.float32)
 
 
 def export_textures(bake: Bake, path: str | Path, scene: Scene, components: int = 0) -> list[Path]:

@@ -39,7 +39,7 @@ def check_export_name(path: Path) -> None:
     """
     if path.suffix.lower() != ".ply":
         raise OptionError(
-            f"cannot export to {path.name}: expected .ply for the cells as points, or .glb, .gltf or .exr for a light map"
+            f"cannot export to {path.name}: expected .ply for points, or .glb, .gltf or .exr for a light map"
         )
     check_own((path, path.with_suffix(".json")), _says_so)
 

@@ -20,7 +20,7 @@ from warp_gi.paths import sky_probability
 from warp_gi.scene.scene import Scene
 from warp_gi.techniques.bake_tool import ExportSettings
 from warp_gi.techniques.paths.estimators import BsdfPaths
-from warp_gi.techniques.shared.atlas.atlas import Atlas
+from warp_gi.techniques.shared.atlas.atlas import Atlas, page_coordinates
 from warp_gi.techniques.shared.atlas.build import NO_SURFACE, make_atlas
 from warp_gi.techniques.shared.atlas.buried import looks_of_slots, off_edges, stand_ins
 from warp_gi.techniques.shared.atlas.densities import parse_texel_sets
@@ -97,6 +97,21 @@ class LightMap:
         known = (slots >= 0) & self.is_known[np.maximum(slots, 0)]
         light = np.where(known[..., None], self.irradiance[np.maximum(slots, 0)], np.float32(0))
         return padded(light, known)
+
+    def at(self, faces: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return the irradiance at points of faces, filtered bilinearly as engines do, W/m^2, float64 [point, 3].
+
+        ``faces`` int [point] are those of the scene, ``u`` and ``v`` [point] barycentric. It is 0 on faces without
+        texels.
+        """
+        image, last = self.image().astype(np.float64), np.array(self.size) - 1
+        pages, uvs = page_coordinates(self.atlas, faces, u, v)
+        at = np.clip(uvs * self.size - 0.5, 0, last)
+        low = at.astype(np.int64)
+        (x, y), (i, j) = (at - low).T[..., None], np.minimum(low + 1, last).T
+        top = image[low[:, 1], low[:, 0]] * (1 - x) + image[low[:, 1], i] * x
+        below = image[j, low[:, 0]] * (1 - x) + image[j, i] * x
+        return np.where((pages >= 0)[:, None], top * (1 - y) + below * y, 0.0)
 
 
 def bake_light_map(

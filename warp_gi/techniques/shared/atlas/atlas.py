@@ -76,3 +76,14 @@ class Atlas:
         slots.points = on_device(self.slot_points, wp.vec2, device)
         slots.sides = on_device(self.slot_sides, wp.uint8, device)
         return slots
+
+
+def page_coordinates(atlas: Atlas, faces: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where points (u, v) of faces are, each [point]: their page, and coordinates in it, float32 [point, 2].
+
+    They are from 0 to 1, v down; page -1 where a face has none.
+    """
+    pages, corners = atlas.face_pages[faces], atlas.corners[faces]
+    weights = np.stack([1.0 - u - v, u, v], axis=-1)[..., None]
+    sizes = atlas.pages[np.maximum(pages, 0), 1:]
+    return pages, ((corners * weights).sum(axis=1) / sizes).astype(np.float32)
