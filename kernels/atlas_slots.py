@@ -36,6 +36,14 @@ def slot_surface(scene: SceneData, slots: AtlasSlots, slot: wp.int32) -> Surface
     return surface_shape(scene, face, slots.points[slot][0], slots.points[slot][1], normal)
 
 
+# Whether a surface lies between two points, which are a little above their own.
+@wp.func
+def are_parted(scene: SceneData, a: wp.vec3, b: wp.vec3) -> wp.bool:
+    way = b - a
+    length = wp.length(way)
+    return length > 0.0 and bvh_occluded(scene.bvh, a, way / length, length * SHADOW_END) != 0
+
+
 # Thread: a pair of slots. Tells whether a surface lies between them, a little above their own.
 @wp.kernel
 def part_slots(
@@ -47,12 +55,9 @@ def part_slots(
     parted: wp.array(dtype=wp.uint8),
 ):
     pair = first + wp.tid()
-    begin = ray_origin(slot_surface(scene, slots, ones[pair]))
-    way = ray_origin(slot_surface(scene, slots, others[pair])) - begin
-    length = wp.length(way)
-    parted[pair] = wp.uint8(0)
-    if length > 0.0 and bvh_occluded(scene.bvh, begin, way / length, length * SHADOW_END) != 0:
-        parted[pair] = wp.uint8(1)
+    one = ray_origin(slot_surface(scene, slots, ones[pair]))
+    other = ray_origin(slot_surface(scene, slots, others[pair]))
+    parted[pair] = wp.uint8(wp.where(are_parted(scene, one, other), 1, 0))
 
 
 # What rays from slots meet, in numbers of rays.

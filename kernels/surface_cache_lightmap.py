@@ -7,12 +7,13 @@ of the path. The cache is read one bounce later, by the rules of all paths: its 
 
 import warp as wp
 
+from warp_gi.kernels.atlas_slots import are_parted
 from warp_gi.kernels.bsdf import lambert
 from warp_gi.kernels.bvh import BvhHit
 from warp_gi.kernels.path_samplers import ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY
 from warp_gi.kernels.path_trace import NO_PATH, PathSettings, path_tracer
 from warp_gi.kernels.sampling import frame_of, hash_uint
-from warp_gi.kernels.surface import Surface, ray_offset, shading_normal
+from warp_gi.kernels.surface import Surface, ray_offset, ray_origin, shading_normal
 from warp_gi.kernels.surface_cache import SURFACE_CACHE
 from warp_gi.kernels.types import SceneData
 
@@ -61,8 +62,20 @@ def white_front(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32) 
     return s
 
 
-# Thread: a texel, from texel `start` on. Its irradiance [W/m^2] by all light: consecutive samples go to one place, as
-# each aligned block of them is spread over the hemisphere by itself.
+@wp.func
+def white_at(scene: SceneData, places: LightMapPlaces, place: wp.int32) -> Surface:
+    return white_front(scene, places.faces[place], places.points[place][0], places.points[place][1])
+
+
+# First sample of place number k among `count` of a texel: consecutive samples go to one place, as each aligned block
+# of them is spread over the hemisphere by itself.
+@wp.func
+def first_sample(places: LightMapPlaces, k: wp.int32, count: wp.int32) -> wp.int32:
+    return k * places.samples / count
+
+
+# Thread: a texel, from texel `start` on. Its irradiance [W/m^2] by all light. Places that get no light at all, and that
+# a surface parts from others that do, lie behind what cuts the texel's surface, and are left out.
 @wp.kernel
 def gather_light(
     first: wp.int32,
@@ -78,14 +91,31 @@ def gather_light(
     count = places.starts[texel + 1] - begin
     seed = hash_uint(wp.uint32(texel) ^ hash_uint(places.seed))
     sum = wp.vec3(0.0, 0.0, 0.0)
-    for k in range(places.samples):
-        at = begin + k * count / places.samples
+    taken = int(0)
+    lit = int(-1)
+    dark = int(0)
+    for place in range(count):
+        s = white_at(scene, places, begin + place)
         hit = BvhHit()
-        hit.face = places.faces[at]
-        hit.u = places.points[at][0]
-        hit.v = places.points[at][1]
-        s = white_front(scene, hit.face, hit.u, hit.v)
-        view = shading_normal(s)
-        r = trace_path(scene, samplers, hit, s, view, paths, wp.uint32(k), seed, NO_PATH)
-        sum = sum + r.environment + r.emitters + r.indirect
-    irradiance[texel] = sum * (wp.pi / wp.float32(places.samples))
+        hit.face = places.faces[begin + place]
+        hit.u = places.points[begin + place][0]
+        hit.v = places.points[begin + place][1]
+        light = wp.vec3(0.0, 0.0, 0.0)
+        for k in range(first_sample(places, place, count), first_sample(places, place + 1, count)):
+            r = trace_path(scene, samplers, hit, s, shading_normal(s), paths, wp.uint32(k), seed, NO_PATH)
+            light = light + r.environment + r.emitters + r.indirect
+        if wp.max(light) > 0.0:
+            sum = sum + light
+            taken += first_sample(places, place + 1, count) - first_sample(places, place, count)
+            lit = place
+        else:
+            dark = dark | (1 << place)
+    for place in range(count):
+        if (dark & (1 << place)) != 0:
+            is_behind = wp.bool(False)
+            if lit >= 0:
+                here = ray_origin(white_at(scene, places, begin + place))
+                is_behind = are_parted(scene, here, ray_origin(white_at(scene, places, begin + lit)))
+            if not is_behind:
+                taken += first_sample(places, place + 1, count) - first_sample(places, place, count)
+    irradiance[texel] = sum * (wp.pi / wp.float32(wp.max(taken, 1)))

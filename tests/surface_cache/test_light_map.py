@@ -185,6 +185,23 @@ def test_beside_a_box_no_texel_is_black():
     assert under.sum() > 20 and found.irradiance[under].max() < 0.1 * np.pi
 
 
+def test_a_wall_through_a_floor_draws_no_dark_line():
+    """Behind the wall is nothing, and no light: texels that it cuts, and those behind it, have the light before it."""
+    wall = quad((0.213, -0.5, 30), (0.3, 0, -60), (0, 30, 0), BLACK, "wall")
+    lamp = gi.PunctualLight("point", intensity=(1.0, 1.0, 1.0), position=(-0.5, 1, 0))
+    scene = scene_of(floor(), wall, lights=[lamp])
+    found = light_map(scene, ABOVE, samples=64, texel_sets="floor=1,wall=0.03", resolution=128)
+    z = np.linspace(-1.2, 1.2, 97)
+    x = 0.213 + 0.3 * (30 - z) / 60 - 0.002
+    across, along = (x + 2) / 4, (2 - z) / 4  # of the floor, as in the test above
+    faces = np.where(across >= along, 0, 1)
+    light = found.at(faces, np.where(faces == 0, across - along, across), np.where(faces == 0, along, along - across))
+    squared = (x + 0.5) ** 2 + 1 + z**2
+    np.testing.assert_allclose(light[:, 0], squared**-1.5, rtol=0.08)
+    beyond = slot_points(scene, found)[:, 0] > 0.6
+    assert (found.irradiance[beyond] == 0).all() and beyond.any()
+
+
 def test_what_lies_inside_of_something_is_known_to_nobody():
     """A small sheet in a closed box: its texels get the colour of others in the picture."""
     hidden = quad((0, 0, 0), (0.02, 0, 0), (0, 0.02, 0), GREY, "hidden")

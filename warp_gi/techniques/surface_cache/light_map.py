@@ -150,15 +150,18 @@ def bake_light_map(
             raise SceneError(NO_SURFACE)
         data, slots = lit_data(scene, target), atlas.slots_on(target)
         inside, backs = looks_of_slots(data, atlas, slots, LOOKS, target)
-        stands_in = stand_ins(data, atlas, slots, inside, backs, target)[:fronts]
         places = _places(atlas, fronts, settings.samples, seed, target)
         light = wp.zeros(fronts, dtype=wp.vec3, device=target)
         for start in range(0, fronts, BATCH):
             inputs = [start, data, _samplers(cells), _paths(scene), places, light]
             launch.launch(kernels.gather_light, min(BATCH, fronts - start), inputs, target, smallest_slice=16)
             tell(ATLAS_SHARE + (1.0 - ATLAS_SHARE) * min(start + BATCH, fronts) / fronts)
+        irradiance = light.numpy()
+        dark = np.zeros(atlas.count, bool)
+        dark[:fronts] = (irradiance == 0).all(axis=1)
+        stands_in = stand_ins(data, atlas, slots, inside, backs, target, dark)[:fronts]
     is_known = (inside[:fronts] <= INSIDE) | (stands_in != np.arange(fronts))
-    return LightMap(atlas, light.numpy()[stands_in], is_known)
+    return LightMap(atlas, irradiance[stands_in], is_known)
 
 
 def _samplers(cells: SurfaceCells) -> kernels.LightMapSamplers:

@@ -44,6 +44,7 @@ def stand_ins(
     inside: np.ndarray,
     backs: np.ndarray,
     device: wp.Device,
+    dark: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return for each slot itself, or the slot nearby whose light stands in for its own, int32 [slots].
 
@@ -59,10 +60,16 @@ def stand_ins(
         inside: Share of each slot's rays that meet what keeps nothing, float32 [slots]. The backs of closed objects do.
         backs: Share of those that meet that or a back, float32 [slots].
         device: Where kernels run.
+        dark: Slots that get no light at all, bool [slots]: outside of a room there may be nothing to meet, and its
+            floor's texels there are as those behind a surface. None is none.
     """
-    result = _nearest_offered(atlas, inside > BEHIND, backs <= CLEAR, REACH_INSIDE)
+    dark = np.zeros(atlas.count, bool) if dark is None else dark
+    offered = (backs <= CLEAR) & ~dark
+    result = _nearest_offered(atlas, inside > BEHIND, offered, REACH_INSIDE)
     behind = (backs > BEHIND) & (inside <= BEHIND)
-    result = np.where(behind, _nearest_offered(atlas, behind, backs <= CLEAR, REACH_BEHIND), result)
+    result = np.where(behind, _nearest_offered(atlas, behind, offered, REACH_BEHIND), result)
+    alone = dark & (result == np.arange(atlas.count))
+    result = np.where(alone, _nearest_offered(atlas, alone, ~dark, REACH_BEHIND), result)
     replaced = np.flatnonzero(result != np.arange(atlas.count)).astype(np.int32)
     whole = replaced[~_are_parted(data, slots, replaced, result[replaced], device)]
     result[whole] = whole
