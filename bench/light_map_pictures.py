@@ -1,4 +1,4 @@
-"""Renders the picture of light maps in docs/techniques/surface_cache.md: ``python -m warp_gi.bench.light_map_pictures``.
+"""Renders the picture of light maps on the page of surface caches: ``python -m warp_gi.bench.light_map_pictures``.
 
 It becomes assets/light_map.jpg: the map of the built-in two rooms, and both rooms by albedo times the map, beside the
 path tracer's pictures.

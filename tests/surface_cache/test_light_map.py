@@ -63,9 +63,10 @@ def lamp_irradiance(points: np.ndarray, height: float = 1.5, order: int = 24) ->
 
 def test_a_white_furnace():
     """Irradiance is pi / (1 - albedo) at every texel, in the corners too."""
-    found = light_map(scene_of(*closed_box(0.8, 1.0)), camera_in_box(), replace(CACHE, paths=60_000), samples=256)
+    box_scene, cache = scene_of(*closed_box(0.8, 1.0)), replace(CACHE, paths=60_000)
+    found = light_map(box_scene, camera_in_box(), cache, resolution=40, samples=128)
     share = found.irradiance / (5 * np.pi)
-    assert len(share) > 2000 and found.is_known.all()
+    assert len(share) > 800 and found.is_known.all()
     np.testing.assert_allclose(share.mean(axis=0), 1, atol=0.005)
     blocks = share[: len(share) // 64 * 64].reshape(-1, 64, 3).mean(axis=1)
     assert np.abs(blocks - 1).max() < 0.02
@@ -106,7 +107,7 @@ def test_a_court_as_by_paths():
     hit = np.flatnonzero(face >= 0)
     shown = np.zeros((len(face), 3))
     shown[hit] = found.at(face[hit], u[hit], v[hit]) / np.pi * frame.numpy("albedo").reshape(-1, 3)[hit]
-    pipeline = gi.Pipeline(spp=128, camera_samples=1)
+    pipeline = gi.Pipeline(spp=64, camera_samples=1)
     traced = next(gi.render(scene, camera, pipeline, device=st.device().alias, seed=2))
     reference = traced.numpy("beauty").reshape(-1, 3)
     lit = np.zeros(len(face), bool)
