@@ -1,7 +1,6 @@
 """Renders the picture of light maps on the page of surface caches: ``python -m warp_gi.bench.light_map_pictures``.
 
-It becomes assets/light_map.jpg: the map of the built-in two rooms, and both rooms by albedo times the map, beside the
-path tracer's pictures.
+It becomes assets/light_map.jpg: the map of the Cornell box, its charts, and two views by it beside the path tracer's.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ import numpy as np
 
 import warp_gi as gi
 from warp_gi.bench.harness.catalogue import ROOT
-from warp_gi.bench.harness.places import PLACES
 from warp_gi.bench.previews import write_jpeg
 from warp_gi.bench.transfer_pictures import SIZE, Row, drawn, rendered
 from warp_gi.cli.report import start_warp
@@ -25,10 +23,9 @@ from warp_gi.files import check_writable
 from warp_gi.scheduler import FrameScheduler
 from warp_gi.techniques.surface_cache.light_map import LightMap, LightMapSettings, bake_light_map
 
-ROOMS = {"two_rooms": "the lit room", "two_rooms_dark": "the dark room"}
-SETTINGS = LightMapSettings(resolution=768, samples=128)
-CACHE = gi.SurfaceCache(cell=0.05)
-REFERENCE_SAMPLES = 128
+SETTINGS = LightMapSettings(resolution=256, samples=256)
+CACHE = gi.SurfaceCache()
+REFERENCE_SAMPLES = 64
 CAMERA_RAYS = 16
 """Rays a pixel of a view by the map."""
 
@@ -47,29 +44,36 @@ def shaded(scene: gi.Scene, camera: gi.Camera, light_map: LightMap, device: str)
     return (total / CAMERA_RAYS).reshape(SIZE[1], SIZE[0], 3).astype(np.float32)
 
 
-def page_of(light_map: LightMap) -> np.ndarray:
-    """Return the map over pi in the size of a picture, every so many texels of it."""
-    image = light_map.image()
-    step = -(-image.shape[0] // SIZE[1])
+def page_of(image: np.ndarray) -> np.ndarray:
+    """Return an image of texels in the size of a picture, every so many of them."""
+    step = -(-max(image.shape[:2]) // min(SIZE))
     page = np.zeros((SIZE[1], SIZE[0], 3), np.float32)
-    small = image[::step, ::step] / np.float32(math.pi)
+    small = image[::step, ::step]
     page[: small.shape[0], : small.shape[1]] = small
     return page
 
 
+def chart_colors(light_map: LightMap) -> np.ndarray:
+    """Return the charts of a light map in colours of their own, float32 [height, width, 3]."""
+    slots, atlas = light_map.atlas.slots[0].reshape(light_map.size[::-1]), light_map.atlas
+    charts = atlas.charts[atlas.slot_faces[np.maximum(slots, 0)]]
+    colors = np.random.default_rng(5).random((int(charts.max()) + 1, 3), np.float32)
+    return np.where((slots >= 0)[..., None], 0.4 * colors[charts], np.float32(0))
+
+
 def rows(device: str) -> list[Row]:
-    """Return the map and a room by it, beside the path tracer, for each room."""
-    scene = gi.builtin_scene("two_rooms")
-    cameras = [PLACES[name].camera().at_resolution(*SIZE) for name in ROOMS]
+    """Return the map and its charts, and two views by it beside the path tracer's."""
+    scene = gi.builtin_scene("cornell_box")
+    cameras = [gi.builtin_camera_path("cornell_box").camera(0).at_resolution(*SIZE)]
+    cameras.append(gi.Camera.look_at((0.85, 1.7, 0.9), (-0.3, 0.4, -0.6), hfov=75, resolution=SIZE))
     path = gi.CameraPath.from_cameras(cameras, times=[0.0, 1.0])
     light_map = bake_light_map(scene, gi.bake(scene, CACHE, device, camera=path), CACHE, SETTINGS, device)
+    pages = {"light map": light_map.image() / np.float32(math.pi), "its charts": chart_colors(light_map)}
     result: list[Row] = []
-    for camera, name in zip(cameras, ROOMS.values(), strict=True):
+    for camera, (name, page) in zip(cameras, pages.items(), strict=True):
         traced = rendered(scene, camera, gi.Pipeline(spp=REFERENCE_SAMPLES), device)
         seen = shaded(scene, camera, light_map, device)
-        result.append(
-            [(f"light map, for {name}", page_of(light_map)), ("albedo times light map", seen), ("paths", traced)]
-        )
+        result.append([(name, page_of(page)), ("albedo times light map", seen), ("paths", traced)])
     return result
 
 

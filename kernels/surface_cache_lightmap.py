@@ -8,7 +8,7 @@ of the path. The cache is read one bounce later, by the rules of all paths: its 
 import warp as wp
 
 from warp_gi.kernels.atlas_slots import are_parted
-from warp_gi.kernels.bsdf import lambert
+from warp_gi.kernels.bsdf import lambert, luminance
 from warp_gi.kernels.bvh import BvhHit
 from warp_gi.kernels.path_samplers import ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY
 from warp_gi.kernels.path_trace import NO_PATH, PathSettings, path_tracer
@@ -18,6 +18,10 @@ from warp_gi.kernels.surface_cache import SURFACE_CACHE
 from warp_gi.kernels.types import SceneData
 
 wp.set_module_options({"enable_backward": False})
+
+SIDE = wp.constant(2)  # places along a side of a texel, which smooths the edges of shadows
+MOST_PLACES = wp.constant(SIDE * SIDE)  # of a texel
+DARKER = wp.constant(wp.float32(0.1))  # share of the light of the brightest place, below which another may be behind
 
 TRACER = path_tracer(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY, SURFACE_CACHE)
 LightMapSamplers = TRACER.samplers
@@ -74,8 +78,32 @@ def first_sample(places: LightMapPlaces, k: wp.int32, count: wp.int32) -> wp.int
     return k * places.samples / count
 
 
-# Thread: a texel, from texel `start` on. Its irradiance [W/m^2] by all light. Places that get no light at all, and that
-# a surface parts from others that do, lie behind what cuts the texel's surface, and are left out.
+# Light of the samples of place number k among `count` of a texel, their sum.
+@wp.func
+def place_light(
+    scene: SceneData,
+    samplers: LightMapSamplers,
+    paths: PathSettings,
+    places: LightMapPlaces,
+    place: wp.int32,
+    begin: wp.int32,
+    end: wp.int32,
+    seed: wp.uint32,
+) -> wp.vec3:
+    s = white_at(scene, places, place)
+    hit = BvhHit()
+    hit.face = places.faces[place]
+    hit.u = places.points[place][0]
+    hit.v = places.points[place][1]
+    light = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(begin, end):
+        r = trace_path(scene, samplers, hit, s, shading_normal(s), paths, wp.uint32(k), seed, NO_PATH)
+        light = light + r.environment + r.emitters + r.indirect
+    return light
+
+
+# Thread: a texel, from texel `start` on. Its irradiance [W/m^2] by all light. Places that are much darker than the
+# brightest, and that a surface parts from it, lie behind what cuts the texel's surface, and are left out.
 @wp.kernel
 def gather_light(
     first: wp.int32,
@@ -90,32 +118,28 @@ def gather_light(
     begin = places.starts[texel]
     count = places.starts[texel + 1] - begin
     seed = hash_uint(wp.uint32(texel) ^ hash_uint(places.seed))
+    lights = wp.matrix(shape=(MOST_PLACES, 3), dtype=wp.float32)
+    brightest = int(0)
+    most = float(-1.0)
+    for place in range(count):
+        low = first_sample(places, place, count)
+        high = first_sample(places, place + 1, count)
+        light = place_light(scene, samplers, paths, places, begin + place, low, high, seed)
+        lights[place] = light
+        mean = luminance(light) / wp.float32(wp.max(high - low, 1))
+        if mean > most:
+            most = mean
+            brightest = place
     sum = wp.vec3(0.0, 0.0, 0.0)
     taken = int(0)
-    lit = int(-1)
-    dark = int(0)
+    lit = ray_origin(white_at(scene, places, begin + brightest))
     for place in range(count):
-        s = white_at(scene, places, begin + place)
-        hit = BvhHit()
-        hit.face = places.faces[begin + place]
-        hit.u = places.points[begin + place][0]
-        hit.v = places.points[begin + place][1]
-        light = wp.vec3(0.0, 0.0, 0.0)
-        for k in range(first_sample(places, place, count), first_sample(places, place + 1, count)):
-            r = trace_path(scene, samplers, hit, s, shading_normal(s), paths, wp.uint32(k), seed, NO_PATH)
-            light = light + r.environment + r.emitters + r.indirect
-        if wp.max(light) > 0.0:
+        samples = first_sample(places, place + 1, count) - first_sample(places, place, count)
+        light = wp.vec3(lights[place, 0], lights[place, 1], lights[place, 2])
+        is_behind = bool(False)
+        if luminance(light) < DARKER * most * wp.float32(samples):
+            is_behind = are_parted(scene, ray_origin(white_at(scene, places, begin + place)), lit)
+        if not is_behind:
             sum = sum + light
-            taken += first_sample(places, place + 1, count) - first_sample(places, place, count)
-            lit = place
-        else:
-            dark = dark | (1 << place)
-    for place in range(count):
-        if (dark & (1 << place)) != 0:
-            is_behind = wp.bool(False)
-            if lit >= 0:
-                here = ray_origin(white_at(scene, places, begin + place))
-                is_behind = are_parted(scene, here, ray_origin(white_at(scene, places, begin + lit)))
-            if not is_behind:
-                taken += first_sample(places, place + 1, count) - first_sample(places, place, count)
+            taken += samples
     irradiance[texel] = sum * (wp.pi / wp.float32(wp.max(taken, 1)))

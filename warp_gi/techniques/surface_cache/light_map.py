@@ -29,8 +29,8 @@ from warp_gi.techniques.shared.atlas.texels import covered_texels
 from warp_gi.techniques.shared.lamps import lit_data
 from warp_gi.techniques.surface_cache.cache import SurfaceCache
 
-SIDE = 2
-"""Places along a side of a texel at which its light is gathered, which smooths the edges of shadows."""
+SIDE = int(kernels.SIDE)
+"""Places along a side of a texel at which its light is gathered."""
 OFF_PLACE = 0.01
 """Largest distance of a point from its place, in texels of ``SIDE`` a texel, for it to lie on the surface there."""
 LOOKS = 16
