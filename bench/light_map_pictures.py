@@ -45,12 +45,13 @@ def shaded(scene: gi.Scene, camera: gi.Camera, light_map: LightMap, device: str)
 
 
 def page_of(image: np.ndarray) -> np.ndarray:
-    """Return an image of texels in the size of a picture, every so many of them."""
-    step = -(-max(image.shape[:2]) // min(SIZE))
-    page = np.zeros((SIZE[1], SIZE[0], 3), np.float32)
-    small = image[::step, ::step]
-    page[: small.shape[0], : small.shape[1]] = small
-    return page
+    """Return an image of texels in the size of a picture, each pixel of it the nearest texel."""
+    height, width = image.shape[:2]
+    texels = max(width / SIZE[0], height / SIZE[1])  # a pixel
+    y, x = (((np.arange(size) + 0.5) * texels).astype(int) for size in reversed(SIZE))
+    inside = (y < height)[:, None] & (x < width)
+    page = image[np.minimum(y, height - 1)[:, None], np.minimum(x, width - 1)]
+    return np.where(inside[..., None], page, np.float32(0))
 
 
 def chart_colors(light_map: LightMap) -> np.ndarray:
