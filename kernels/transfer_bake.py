@@ -7,6 +7,8 @@ it sees sky and surfaces both; only then do the others follow. The first of them
 import warp as wp
 
 from warp_gi.kernels.alias import alias_choice
+from warp_gi.kernels.atlas import SurfaceAtlas, atlas_nearest, side_seen
+from warp_gi.kernels.atlas_slots import AtlasSlots, slot_surface
 from warp_gi.kernels.bvh import bvh_intersect, bvh_occluded
 from warp_gi.kernels.emitters import LightChoice, may_hit_emitter, sample_emitter, triangle_light_pdf
 from warp_gi.kernels.light_connections import SHADOW_END
@@ -24,8 +26,7 @@ from warp_gi.kernels.sampling import (
     sample_1d,
     sample_2d,
 )
-from warp_gi.kernels.surface import Surface, ray_origin, shading_normal, surface_emission, surface_shape
-from warp_gi.kernels.transfer_atlas import BACK, TransferAtlas, atlas_nearest, side_seen
+from warp_gi.kernels.surface import Surface, ray_origin, shading_normal, surface_emission
 from warp_gi.kernels.transfer_native import BLOCK_RAYS, Numbers, bit_count, harmonic_sums, open_transfer
 from warp_gi.kernels.types import Bvh, SceneData
 
@@ -35,14 +36,6 @@ SETS = wp.constant(64)  # of directions
 SKY = wp.constant(-1)  # a ray that hits nothing
 BLACK = wp.constant(-2)  # a ray that hits what keeps no transfer
 BELOW = wp.constant(-3)  # a ray that starts below the surface
-
-
-# Where the slots are: see warp_gi/techniques/radiance_transfer/textures.py.
-@wp.struct
-class TransferSlots:
-    faces: wp.array(dtype=wp.int32)  # [slot]
-    points: wp.array(dtype=wp.vec2)  # [slot] u, v
-    sides: wp.array(dtype=wp.uint8)  # [slot]
 
 
 @wp.struct
@@ -74,18 +67,6 @@ def draw_directions(first: wp.int32, rays: TransferRays):
         rays.directions[axis, k] = d[axis]
 
 
-# The surface at a slot, seen from its side.
-@wp.func
-def slot_surface(scene: SceneData, slots: TransferSlots, slot: wp.int32) -> Surface:
-    face = slots.faces[slot]
-    ids = scene.geometry.indices[face]
-    p0 = scene.geometry.points[ids[0]]
-    normal = wp.normalize(wp.cross(scene.geometry.points[ids[1]] - p0, scene.geometry.points[ids[2]] - p0))
-    if wp.int32(slots.sides[slot]) == BACK:
-        normal = -normal
-    return surface_shape(scene, face, slots.points[slot][0], slots.points[slot][1], normal)
-
-
 # First direction of a slot's set.
 @wp.func
 def set_start(rays: TransferRays, slot: wp.int32) -> wp.int32:
@@ -111,7 +92,7 @@ def ray_direction(rays: TransferRays, frame: wp.mat33, item: wp.int32) -> wp.vec
 # The slot that a ray hits, SKY or BLACK.
 @wp.func
 def hit_slot(
-    scene: SceneData, atlas: TransferAtlas, rays: TransferRays, origin: wp.vec3, direction: wp.vec3
+    scene: SceneData, atlas: SurfaceAtlas, rays: TransferRays, origin: wp.vec3, direction: wp.vec3
 ) -> wp.int32:
     hit = bvh_intersect(scene.bvh, origin, direction, float(wp.inf))
     if hit.face < 0:
@@ -129,7 +110,7 @@ def hit_slot(
 @wp.func
 def free_rays(
     scene: SceneData,
-    atlas: TransferAtlas,
+    atlas: SurfaceAtlas,
     rays: TransferRays,
     s: Surface,
     slot: wp.int32,
@@ -163,8 +144,8 @@ def trace_transfer(
     first: wp.int32,
     start: wp.int32,
     scene: SceneData,
-    atlas: TransferAtlas,
-    slots: TransferSlots,
+    atlas: SurfaceAtlas,
+    slots: AtlasSlots,
     rays: TransferRays,
     results: TransferResults,
 ):
@@ -199,25 +180,6 @@ def trace_transfer(
         exact = exact + (sums - every * share) * (wp.pi / wp.float32(done))
     for k in range(numbers):
         results.transfer[slot, k] = wp.float16(exact[k])
-
-
-# Thread: a pair of slots. Tells whether a surface lies between them, a little above their own.
-@wp.kernel
-def part_slots(
-    first: wp.int32,
-    scene: SceneData,
-    slots: TransferSlots,
-    ones: wp.array(dtype=wp.int32),
-    others: wp.array(dtype=wp.int32),
-    parted: wp.array(dtype=wp.uint8),
-):
-    pair = first + wp.tid()
-    begin = ray_origin(slot_surface(scene, slots, ones[pair]))
-    way = ray_origin(slot_surface(scene, slots, others[pair])) - begin
-    length = wp.length(way)
-    parted[pair] = wp.uint8(0)
-    if length > 0.0 and bvh_occluded(scene.bvh, begin, way / length, length * SHADOW_END) != 0:
-        parted[pair] = wp.uint8(1)
 
 
 # How lamps are sampled at a slot.
@@ -269,7 +231,7 @@ def light_slots(
     first: wp.int32,
     start: wp.int32,
     scene: SceneData,
-    slots: TransferSlots,
+    slots: AtlasSlots,
     lamps: LampSamples,
     result: wp.array(dtype=wp.vec3),
 ):

@@ -2,10 +2,11 @@
 
 import warp as wp
 
+from warp_gi.kernels.atlas import BACK, SurfaceAtlas
+from warp_gi.kernels.atlas_slots import AtlasSlots, slot_surface
 from warp_gi.kernels.bsdf import average_reflectance
 from warp_gi.kernels.surface import surface_at
-from warp_gi.kernels.transfer_atlas import BACK, TransferAtlas
-from warp_gi.kernels.transfer_bake import TransferRays, TransferSlots, ray_direction, set_frame, set_start, slot_surface
+from warp_gi.kernels.transfer_bake import TransferRays, ray_direction, set_frame, set_start
 from warp_gi.kernels.transfer_native import Numbers, gather_row, harmonics_at
 from warp_gi.kernels.transfer_snippets import LIGHT_NUMBERS, LIGHT_ORDER
 from warp_gi.kernels.types import SceneData
@@ -29,7 +30,7 @@ class BounceRows:
 
 # u and v of a face for a step of one texel along x and along y, by columns; 0 where there are none.
 @wp.func
-def texel_steps(atlas: TransferAtlas, face: wp.int32) -> wp.mat22:
+def texel_steps(atlas: SurfaceAtlas, face: wp.int32) -> wp.mat22:
     if atlas.corners.shape[0] == 0 or atlas.corner_slots.shape[0] > 0:
         return wp.mat22(0.0, 0.0, 0.0, 0.0)
     a = atlas.corners[face, 1] - atlas.corners[face, 0]
@@ -43,7 +44,7 @@ def texel_steps(atlas: TransferAtlas, face: wp.int32) -> wp.mat22:
 # Thread: a slot. What its surface reflects of light from everywhere, averaged over the part of its texel on its face.
 @wp.kernel
 def reflect_slots(
-    first: wp.int32, scene: SceneData, atlas: TransferAtlas, slots: TransferSlots, result: wp.array(dtype=wp.vec3)
+    first: wp.int32, scene: SceneData, atlas: SurfaceAtlas, slots: AtlasSlots, result: wp.array(dtype=wp.vec3)
 ):
     slot = first + wp.tid()
     face = slots.faces[slot]
@@ -110,7 +111,7 @@ def gather_light(
 def gather_glossy(
     first: wp.int32,
     scene: SceneData,
-    slots: TransferSlots,
+    slots: AtlasSlots,
     rays: TransferRays,
     hits: wp.array2d(dtype=wp.int32),
     radiance: wp.array(dtype=wp.vec3),

@@ -7,12 +7,12 @@ reflect is the sum of F_k M_kj T_j with the sky's matrix M (TPFL of the paper).
 
 import warp as wp
 
+from warp_gi.kernels.atlas import SlotFetch, SurfaceAtlas, atlas_fetch, side_seen
 from warp_gi.kernels.bsdf import Bsdf, average_reflectance, bsdf_evaluate, diffuse_share
 from warp_gi.kernels.bvh import BvhHit, bvh_occluded
 from warp_gi.kernels.path_samplers import KnownRadiance, PathCache
 from warp_gi.kernels.sampling import circle, frame_of
 from warp_gi.kernels.surface import Surface, ray_origin, shading_normal
-from warp_gi.kernels.transfer_atlas import SlotFetch, TransferAtlas, atlas_fetch, side_seen
 from warp_gi.kernels.transfer_lobes import (
     LobeTable,
     PrefilteredSky,
@@ -36,7 +36,7 @@ MOST_SHARE = wp.constant(wp.float32(1.5))  # of the light of an open lobe
 # What a bake holds, and where it is kept. Rows are padded (transfer_products.py).
 @wp.struct
 class TransferRows:
-    atlas: TransferAtlas
+    atlas: SurfaceAtlas
     transfer: wp.array2d(dtype=wp.float16)  # [slot, width], of width 32 or 40
     bounces: wp.array2d(dtype=wp.float16)  # [slot, 3 * 32]; empty without bounces
     lamps: wp.array(dtype=wp.vec3)  # [slot] W/m^2 by lamps over other surfaces; empty without

@@ -2,10 +2,10 @@
 
 import warp as wp
 
+from warp_gi.kernels.atlas import SlotFetch
 from warp_gi.kernels.gbuffer import PassSettings, PrimaryHits, tiled_pixel
 from warp_gi.kernels.sampling import TRANSFER_SUN_DIMENSION, pixel_sample_index, pixel_seed, sample_2d
 from warp_gi.kernels.surface import Surface, surface_at
-from warp_gi.kernels.transfer_atlas import SlotFetch
 from warp_gi.kernels.transfer_light import (
     TransferRows,
     TransferSky,

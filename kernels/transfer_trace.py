@@ -6,6 +6,7 @@ rays are traced: what they meet is lit by the textures.
 
 import warp as wp
 
+from warp_gi.kernels.atlas import SlotFetch
 from warp_gi.kernels.bsdf import average_reflectance, diffuse_share, lambert, specular_sample
 from warp_gi.kernels.bvh import BvhHit, bvh_intersect
 from warp_gi.kernels.gbuffer import PassSettings, PrimaryHits, tiled_pixel
@@ -26,7 +27,6 @@ from warp_gi.kernels.sampling import (
     sample_2d,
 )
 from warp_gi.kernels.surface import Surface, ray_origin, surface_at
-from warp_gi.kernels.transfer_atlas import SlotFetch
 from warp_gi.kernels.transfer_light import (
     TRANSFER_CACHE,
     TransferCache,

@@ -8,7 +8,7 @@ from transfer_tools import transfer_settings
 import warp_gi as gi
 from warp_gi.scene.scene import Scene
 from warp_gi.techniques.radiance_transfer.settings import TransferSettings
-from warp_gi.techniques.radiance_transfer.textures import Atlas
+from warp_gi.techniques.shared.atlas.atlas import Atlas
 
 
 def settings(**changes) -> TransferSettings:

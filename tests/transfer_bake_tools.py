@@ -11,8 +11,9 @@ from warp_gi.baking import Bake
 from warp_gi.scene import harmonics
 from warp_gi.scene.model import Material, Mesh, Node, Texture
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.radiance_transfer.atlas import make_atlas
-from warp_gi.techniques.radiance_transfer.textures import TECHNIQUE, Atlas, TransferTextures
+from warp_gi.techniques.radiance_transfer.textures import TECHNIQUE, TransferTextures
+from warp_gi.techniques.shared.atlas.atlas import Atlas
+from warp_gi.techniques.shared.atlas.build import make_atlas
 
 GROUND = Texture("checks", np.tile(np.array([[[250, 128, 64, 255], [10, 200, 90, 255]]], np.uint8), (2, 1, 1)))
 

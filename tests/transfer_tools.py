@@ -9,7 +9,7 @@ import numpy as np
 import warp_gi as gi
 from warp_gi.scene.harmonics import basis
 from warp_gi.techniques.radiance_transfer.settings import TransferSettings
-from warp_gi.techniques.radiance_transfer.textures import Atlas
+from warp_gi.techniques.shared.atlas.atlas import Atlas
 
 SETTINGS: dict[str, Any] = {
     "storage": "texture",

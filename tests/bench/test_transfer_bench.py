@@ -13,8 +13,8 @@ from warp_gi.bench.publish.figures import Grid
 from warp_gi.bench.suites.transfer import bakes, errors, frames, memory, paper, seams, shapes, vertices, views
 from warp_gi.bench.suites.transfer.columns import COLUMNS
 from warp_gi.bench.suites.transfer.regions import REGIONS
-from warp_gi.techniques.radiance_transfer.atlas import make_atlas
 from warp_gi.techniques.radiance_transfer.textures import transfer_textures
+from warp_gi.techniques.shared.atlas.build import make_atlas
 
 SMALL = {"resolution": 32, "first_rays": 64, "rays": 64}
 

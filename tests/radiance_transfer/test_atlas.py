@@ -25,12 +25,13 @@ from scene_tools import GREY, quad, sphere
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.techniques.radiance_transfer import chart_cache, chart_job, chart_worker, charts
-from warp_gi.techniques.radiance_transfer.atlas import make_atlas
-from warp_gi.techniques.radiance_transfer.buried import MARGIN
-from warp_gi.techniques.radiance_transfer.densities import automatic_factors, density_factors, parse_texel_sets
-from warp_gi.techniques.radiance_transfer.islands import islands
-from warp_gi.techniques.radiance_transfer.textures import Atlas
+from warp_gi.techniques.radiance_transfer.bake import OTHERWISE
+from warp_gi.techniques.shared.atlas import chart_cache, chart_job, chart_worker, charts
+from warp_gi.techniques.shared.atlas.atlas import Atlas
+from warp_gi.techniques.shared.atlas.build import make_atlas
+from warp_gi.techniques.shared.atlas.buried import MARGIN
+from warp_gi.techniques.shared.atlas.densities import automatic_factors, density_factors, parse_texel_sets
+from warp_gi.techniques.shared.atlas.islands import islands
 
 RUN = charts.ChartJob.run
 
@@ -375,8 +376,8 @@ def test_automatic_factors_keep_to_their_share():
 def test_time_limit(monkeypatch):
     monkeypatch.setattr(charts.ChartJob, "run", RUN)
     scene = scene_of(ball(rings=90))
-    with pytest.raises(gi.OptionError, match=r'chart_seconds=0.05 .*charts="own".*storage="vertices"'):
-        make_atlas(scene, settings(chart_seconds=0.05), "cpu")
+    with pytest.raises(gi.OptionError, match=r'chart_seconds=0.05 .*, take .*charts="own"\), or .*storage="vertices"'):
+        make_atlas(scene, settings(chart_seconds=0.05), "cpu", otherwise=OTHERWISE)
 
 
 def test_a_worker_that_fails(monkeypatch):
@@ -456,7 +457,7 @@ def test_charts_that_do_not_fit(size, monkeypatch):
     """The error names a resolution that will do, and leaves charts half of the page."""
     monkeypatch.setattr(charts, "STEP", 4)
     scene = scene_of(soup(300))
-    words = rf'resolution {size} is too small for the [0-9]+ charts .*: take about ([0-9]+), .*charts="own".*"vertices"'
+    words = rf'resolution {size} is too small for the [0-9]+ charts .*: take about ([0-9]+), or .*charts="own"\)$'
     with pytest.raises(gi.OptionError, match=words) as told:
         make_atlas(scene, settings(resolution=size), "cpu")
     wanted = int(re.search("take about ([0-9]+)", str(told.value))[1])
@@ -564,7 +565,7 @@ def test_two_processes_that_bake_one_scene_at_once(tmp_path):
     script = """
 import sys
 import numpy as np
-from warp_gi.techniques.radiance_transfer import charts
+from warp_gi.techniques.shared.atlas import charts
 print("ready", flush=True)
 sys.stdin.readline()
 points = np.random.default_rng(0).random((40, 3, 3))

@@ -8,8 +8,8 @@ import pytest
 from atlas_tools import fetched, points_of, random_points, settings, slot_positions
 
 import warp_gi as gi
-from warp_gi.techniques.radiance_transfer import chart_cache
-from warp_gi.techniques.radiance_transfer.atlas import make_atlas
+from warp_gi.techniques.shared.atlas import chart_cache
+from warp_gi.techniques.shared.atlas.build import make_atlas
 
 SCENES = Path(os.environ.get("WARP_GI_SCENES", Path(__file__).parents[2] / ".." / "shared" / "scenes"))
 

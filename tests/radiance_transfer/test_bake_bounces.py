@@ -14,8 +14,8 @@ from warp_gi import launch
 from warp_gi.errors import OptionError
 from warp_gi.scene.harmonics import basis
 from warp_gi.techniques.radiance_transfer import bounces as baking
-from warp_gi.techniques.radiance_transfer.atlas import make_atlas
 from warp_gi.techniques.radiance_transfer.rays import trace_slots, transfer_work
+from warp_gi.techniques.shared.atlas.build import make_atlas
 
 WHITE = np.sqrt(4 * np.pi)  # the first coefficient of a sky of radiance 1; the others are 0
 ALBEDO = np.array([0.9, 0.5, 0.2])

@@ -13,11 +13,11 @@ import warp_gi as gi
 from warp_gi import launch
 from warp_gi.bench.harness.scenes import LIVING_ROOM, SCENES
 from warp_gi.errors import BakeError, SceneError
-from warp_gi.techniques.radiance_transfer.atlas import make_atlas
 from warp_gi.techniques.radiance_transfer.bake import bake_transfer, regather, transfer_key
 from warp_gi.techniques.radiance_transfer.rays import trace_slots, transfer_work
 from warp_gi.techniques.radiance_transfer.textures import transfer_textures
 from warp_gi.techniques.radiance_transfer.vertices import vertex_atlas
+from warp_gi.techniques.shared.atlas.build import make_atlas
 from warp_gi.techniques.shared.lamps import lamps_move
 
 ATLAS = ("corners", "face_pages", "charts", "pages", "slots", "corner_slots", "slot_faces", "slot_points", "slot_sides")

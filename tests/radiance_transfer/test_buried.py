@@ -11,9 +11,10 @@ from transfer_tools import transfer_settings
 import warp_gi as gi
 from warp_gi.bench.harness.court import block, court, court_camera
 from warp_gi.launch import get_device
-from warp_gi.techniques.radiance_transfer.atlas import make_atlas
-from warp_gi.techniques.radiance_transfer.buried import CLEAR, MARGIN, back_shares, off_edges, without_buried
+from warp_gi.techniques.radiance_transfer.buried import back_shares, without_buried
 from warp_gi.techniques.radiance_transfer.rays import trace_slots, transfer_work
+from warp_gi.techniques.shared.atlas.build import make_atlas
+from warp_gi.techniques.shared.atlas.buried import CLEAR, MARGIN, off_edges
 
 GREY = gi.Material("grey", (0.6, 0.6, 0.6), specular=0.0)
 

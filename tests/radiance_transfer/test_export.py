@@ -20,10 +20,11 @@ import warp_gi as gi
 from warp_gi.errors import BakeError, OptionError
 from warp_gi.scene import harmonics
 from warp_gi.techniques.radiance_transfer import export
-from warp_gi.techniques.radiance_transfer.gltf_export import drawn_triangles
-from warp_gi.techniques.radiance_transfer.textures import Atlas, TransferTextures
+from warp_gi.techniques.radiance_transfer.textures import TransferTextures
 from warp_gi.techniques.radiance_transfer.transfer_file import read_export
 from warp_gi.techniques.radiance_transfer.vertices import vertex_atlas
+from warp_gi.techniques.shared.atlas.atlas import Atlas, page_coordinates
+from warp_gi.techniques.shared.atlas.gltf import drawn_triangles
 from warp_gi.techniques.shared.exr_parts import read_exr_parts
 
 LIGHT = np.random.default_rng(3).normal(size=(3, 25)).astype(np.float32)
@@ -127,7 +128,7 @@ def test_the_reader_filters_as_kernels_do(exported, side):
     textures, path = exported
     faces, u, v = random_points(np.arange(len(textures.atlas.face_pages)), 20)
     file = read_export(path.with_suffix(".json"))
-    pages, uvs = export.page_coordinates(textures.atlas, faces, u, v)
+    pages, uvs = page_coordinates(textures.atlas, faces, u, v)
     found = file.irradiance(pages, uvs, LIGHT, side)
     wanted = directly(textures, faces, u, v, side, LIGHT)
     np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-3)
@@ -241,7 +242,7 @@ def test_components_are_exported(scene, tmp_path):
     part = next(part for part in info["parts"] if part["kind"] == "bounces")
     assert part["channels"] == [f"P.{i:02d}" for i in range(16)] and len(part["rgba_parts"]) == 4
     faces, u, v = random_points(np.arange(len(textures.atlas.face_pages)), 50)
-    pages, uvs = export.page_coordinates(textures.atlas, faces, u, v)
+    pages, uvs = page_coordinates(textures.atlas, faces, u, v)
     whole = tmp_path / "b.exr"
     export.export_textures(bake_of(textures, scene), whole, scene)
     light = LIGHT + np.eye(25)[0] * 8
@@ -507,7 +508,7 @@ def test_no_file_of_another_is_overwritten(tmp_path):
     export.check_export_name(tmp_path / "other.exr")
 
 
-@pytest.mark.parametrize(("generator", "told"), [(export.GENERATOR, ""), ("another", "is not of an earlier export")])
+@pytest.mark.parametrize(("generator", "told"), [(export.FORMAT, ""), ("another", "is not of an earlier export")])
 def test_a_glb_of_many_parts_says_at_its_end_by_whom_it_is(tmp_path, generator, told):
     """Who made it stands behind all accessors, of which there may be more than any fixed number of bytes."""
     text = json.dumps({"accessors": [{"name": "x" * 50}] * 5000, "asset": {"generator": generator}}).encode()

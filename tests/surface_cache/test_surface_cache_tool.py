@@ -62,7 +62,10 @@ def test_an_export_holds_cells_as_points(made):
 def test_what_cannot_be_baked_or_exported(tmp_path, capsys):
     for more, told in (
         (["--everywhere"], "a surface cache is of what the camera path needs: omit it"),
-        (["--export", str(tmp_path / "a.exr")], "the cells of a surface cache are points in a .ply file"),
+        (
+            ["--export", str(tmp_path / "a.obj")],
+            "cannot export to a.obj: expected .ply for points, or .glb, .gltf or .exr",
+        ),
         (["--vertices=0"], "vertices must be a whole number from 1 to 64, got 0"),
     ):
         assert main([*BAKE, "-o", str(tmp_path / "a.safetensors"), *more]) == 2

@@ -30,7 +30,7 @@ from warp_gi.rendering import bake
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.scene import Scene
 from warp_gi.stateful import Stateful
-from warp_gi.techniques.bake_tool import BakeTool
+from warp_gi.techniques.bake_tool import BakeTool, ExportRequest, ExportSettings
 
 BAKEABLE = registry.bakeable()
 DEFAULT_TECHNIQUE = next(iter(BAKEABLE))
@@ -78,6 +78,9 @@ class BakeOptions(SceneOptions):
     settings: Annotated[Stateful, tyro.conf.arg(name="")] = field(
         default_factory=lambda: tool_of(DEFAULT_TECHNIQUE).settings()
     )
+    export_settings: Annotated[ExportSettings, tyro.conf.arg(name="")] = field(
+        default_factory=lambda: tool_of(DEFAULT_TECHNIQUE).export_settings()
+    )
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -91,7 +94,8 @@ def parse(arguments: Sequence[str]) -> BakeOptions:
     Raises OptionError for those that are unknown or cannot be read.
     """
     name = technique_of(arguments)
-    default = BakeOptions(technique=name, settings=tool_of(name).settings())
+    tool = tool_of(name)
+    default = BakeOptions(technique=name, settings=tool.settings(), export_settings=tool.export_settings())
     options = parse_options(BakeOptions, "bake", arguments, description(), default)
     options.technique = name
     return options
@@ -109,7 +113,11 @@ def technique_of(arguments: Sequence[str]) -> str:
     """
     given = value_given(arguments, "--technique")
     chosen = DEFAULT_TECHNIQUE if given is None else registry.technique_named(given, BAKEABLE.values()).name
-    names = {name: {field.name for field in fields(tool_of(name).settings)} for name in BAKEABLE}
+    tools = {name: tool_of(name) for name in BAKEABLE}
+    names = {
+        name: {field.name for kind in (tool.settings, tool.export_settings) for field in fields(kind)}
+        for name, tool in tools.items()
+    }
     for argument in arguments:
         flag = argument.partition("=")[0]
         setting = flag.removeprefix("--").removeprefix("no-").replace("-", "_")
@@ -153,6 +161,7 @@ def run(options: BakeOptions, report: Reporter) -> None:
         raise OptionError(f"cannot write {output.name}: bakes are .safetensors files")
     if options.export is not None:
         tool.check_export(options.settings, options.export, options.export_components)
+    tool.check_export_settings(options.export_settings, options.export)
     if options.export_components and (options.export is None or not tool.compresses):
         names = " or ".join(name for name in BAKEABLE if tool_of(name).compresses)
         raise OptionError(f"--export-components goes with --export of {names}; leave it out")
@@ -191,8 +200,10 @@ def run(options: BakeOptions, report: Reporter) -> None:
     if compiled > 0.5:
         report.line(f"{compiled:.1f} s of that compiling kernels")
     if options.export is not None:
-        with report.phase("export"):
-            exported = tool.export(result, options.export, scene, options.export_components)
+        with report.shares("export") as tell:
+            asked = options.settings, options.export_settings, options.export_components
+            request = ExportRequest(*asked, options.device, options.seed, tell)
+            exported = tool.export(result, options.export, scene, request)
         more = f" to {exported[-2].name}" * (len(exported) > 2)
         report.line(f"{tool.exported}: {exported[0]}{more}, described by {exported[-1]}")
     if options.view is not None and camera is not None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Generic, NamedTuple, TypeVar
 
@@ -31,6 +32,32 @@ class Table(NamedTuple):
     """Rows, each with a value for every column."""
 
 
+@dataclass(frozen=True)
+class ExportSettings:
+    """Settings of an export beside those of the bake: flags of ``warp-gi bake``. These are none."""
+
+    def validate(self) -> None:
+        """Raise OptionError for settings out of range."""
+
+
+@dataclass(frozen=True)
+class ExportRequest(Generic[Settings]):
+    """How an export is made."""
+
+    settings: Settings
+    """Settings of the bake."""
+    own: ExportSettings = field(default_factory=ExportSettings)
+    """Settings of the export, of the class that ``BakeTool.export_settings`` names."""
+    components: int = 0
+    """Number of principal components to compress to; 0 compresses nothing."""
+    device: str = "cpu"
+    """Device to compute on."""
+    seed: int = 1
+    """Seed that every random number follows from."""
+    progress: Callable[[float], None] = field(default=lambda share: None)
+    """Called with the share that is done."""
+
+
 class BakeTool(ABC, Generic[Settings]):
     """How one technique is baked from the command line.
 
@@ -49,6 +76,8 @@ class BakeTool(ABC, Generic[Settings]):
     """Arguments of the command's examples, as "hall.glb --cell-size 0.5"; without ``--technique``."""
     exported: ClassVar[str]
     """Word for the files of an export, as "textures"."""
+    export_settings: ClassVar[type[ExportSettings]] = ExportSettings
+    """Class of the settings that an export has beside those of the bake; its fields are flags."""
     compresses: ClassVar[bool] = False
     """Whether an export can hold principal components of something, so that ``components`` may be above 0."""
     views: ClassVar[Sequence[str]] = ()
@@ -70,16 +99,16 @@ class BakeTool(ABC, Generic[Settings]):
     def check_export(self, settings: Settings, path: Path, components: int) -> None:
         """Raise OptionError for a file that an export cannot be, and for settings whose bake cannot be exported."""
 
+    def check_export_settings(self, own: ExportSettings, path: Path | None) -> None:
+        """Raise OptionError for settings of an export that are out of range, or mean nothing for this file or none."""
+
     def exported_files(self, path: Path) -> list[Path]:
         """Return the files that ``export`` writes, but for those whose number the bake decides."""
         return [path, path.with_suffix(".json")]
 
     @abstractmethod
-    def export(self, bake: Bake, path: Path, scene: Scene, components: int) -> list[Path]:
-        """Write the files of an export of the scene's bake and return them, the description last.
-
-        ``components`` is the number of principal components to compress to; 0 compresses nothing.
-        """
+    def export(self, bake: Bake, path: Path, scene: Scene, request: ExportRequest[Settings]) -> list[Path]:
+        """Write the files of an export of the scene's bake and return them, the description last."""
 
     def check_view(self, settings: Settings, path: Path) -> None:
         """Raise OptionError for a page that ``view`` cannot write; here for every one."""

@@ -19,9 +19,9 @@ from warp_gi import launch
 from warp_gi.bench.harness.court import court
 from warp_gi.bench.harness.measure import Row, attempt, timed
 from warp_gi.bench.harness.places import PLACES
-from warp_gi.techniques.radiance_transfer.atlas import make_atlas
 from warp_gi.techniques.radiance_transfer.rays import trace_slots, transfer_work
-from warp_gi.techniques.radiance_transfer.textures import Atlas
+from warp_gi.techniques.shared.atlas.atlas import Atlas
+from warp_gi.techniques.shared.atlas.build import make_atlas
 
 UNIFORM, ADAPTIVE = "bakes: 256 rays a slot", "bakes: adaptive rays"
 WHOLE, CHARTS = "bakes: whole, charts known", "bakes: charts"

@@ -22,7 +22,8 @@ from warp_gi.bench.suites.transfer.views import (
     true_sky,
     under,
 )
-from warp_gi.techniques.radiance_transfer.textures import Atlas, transfer_textures
+from warp_gi.techniques.radiance_transfer.textures import transfer_textures
+from warp_gi.techniques.shared.atlas.atlas import Atlas
 
 RESOLUTION, BOUNCES = "errors: resolution", "errors: bounces"
 OTHER, SKIES = "errors: another smooth sky", "errors: real skies"

@@ -6,9 +6,9 @@ over the tripling coefficients that are not 0, once for each channel; reordered,
 
 import warp as wp
 
+from warp_gi.kernels.atlas import SurfaceAtlas
 from warp_gi.kernels.gbuffer import PrimaryHits, tiled_pixel
 from warp_gi.kernels.surface import shading_normal, surface_at
-from warp_gi.kernels.transfer_atlas import TransferAtlas
 from warp_gi.kernels.transfer_light import TransferRows, is_kept, surface_slots
 from warp_gi.kernels.transfer_products import glossy_product, vec6
 from warp_gi.kernels.transfer_snippets import HARMONICS, HAS_VECTOR_HALVES
@@ -154,7 +154,7 @@ def evaluate_vertices(
 @wp.kernel(enable_backward=False)
 def interpolate_vertices(
     first: wp.int32,
-    atlas: TransferAtlas,
+    atlas: SurfaceAtlas,
     vertex_colors: wp.array(dtype=wp.vec3),
     hits: PrimaryHits,
     width: wp.int32,

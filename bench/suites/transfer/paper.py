@@ -24,7 +24,8 @@ from warp_gi.launch import on_device
 from warp_gi.scene.baked import whole_scene
 from warp_gi.techniques.radiance_transfer import products
 from warp_gi.techniques.radiance_transfer.lobes import phong
-from warp_gi.techniques.radiance_transfer.textures import Atlas, transfer_textures
+from warp_gi.techniques.radiance_transfer.textures import transfer_textures
+from warp_gi.techniques.shared.atlas.atlas import Atlas
 
 TABLE = "paper, table 1: stand-ins"
 QUOTED = "paper, table 1: RTX 3090"

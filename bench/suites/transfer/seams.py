@@ -8,7 +8,8 @@ import warp_gi as gi
 from warp_gi.bench.harness.measure import Row
 from warp_gi.bench.suites.transfer import shapes
 from warp_gi.bench.suites.transfer.views import smooth_sky
-from warp_gi.techniques.radiance_transfer.textures import Atlas, TransferTextures, transfer_textures
+from warp_gi.techniques.radiance_transfer.textures import TransferTextures, transfer_textures
+from warp_gi.techniques.shared.atlas.atlas import Atlas
 
 TABLE = "seams"
 RESOLUTIONS, QUICK_RESOLUTIONS = (64, 128, 256, 512), (64, 128)

@@ -8,7 +8,7 @@ from warp_gi.baking import Bake
 from warp_gi.errors import OptionError
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.bake_tool import BakeTool, Rows, Table, times
+from warp_gi.techniques.bake_tool import BakeTool, ExportRequest, Rows, Table, times
 from warp_gi.techniques.light_field import export as export_files
 from warp_gi.techniques.light_field import pictures
 from warp_gi.techniques.light_field.estimator import LightFieldProbes
@@ -58,7 +58,7 @@ class LightFieldTool(BakeTool[LightFieldProbes]):
         atlases = [path.with_name(f"{path.stem}.{name}.exr") for name in export_files.ATLASES]
         return [*atlases, *super().exported_files(path)[1:]]
 
-    def export(self, bake: Bake, path: Path, scene: Scene, components: int) -> list[Path]:
+    def export(self, bake: Bake, path: Path, scene: Scene, request: ExportRequest[LightFieldProbes]) -> list[Path]:
         """Write the maps as atlases."""
         return export_files.export_atlases(bake, path)
 

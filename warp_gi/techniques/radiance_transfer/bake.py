@@ -16,7 +16,6 @@ from warp_gi.errors import BakeError, SceneError
 from warp_gi.kernels.transfer_bake import BLACK
 from warp_gi.launch import get_device
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.radiance_transfer.atlas import NO_SURFACE, make_atlas
 from warp_gi.techniques.radiance_transfer.bounces import (
     gather_bounces,
     gather_light,
@@ -32,16 +31,14 @@ from warp_gi.techniques.radiance_transfer.rays import (
     transfer_work,
 )
 from warp_gi.techniques.radiance_transfer.settings import TransferSettings
-from warp_gi.techniques.radiance_transfer.textures import (
-    LIGHT_NUMBERS,
-    TECHNIQUE,
-    Atlas,
-    TransferTextures,
-    transfer_textures,
-)
+from warp_gi.techniques.radiance_transfer.textures import LIGHT_NUMBERS, TECHNIQUE, TransferTextures, transfer_textures
 from warp_gi.techniques.radiance_transfer.vertices import vertex_atlas
+from warp_gi.techniques.shared.atlas.atlas import Atlas
+from warp_gi.techniques.shared.atlas.build import NO_SURFACE, make_atlas
 from warp_gi.techniques.shared.lamps import lamps_move
 
+OTHERWISE = 'keep transfer at vertices (storage="vertices")'
+"""What can be done where no charts can be made."""
 STAGES = {"charts": 0.4, "rays": 0.4, "bounces": 0.2}
 """Shares of the work of a bake's stages, for progress alone."""
 
@@ -123,7 +120,7 @@ def bake_transfer(
         _check_motion(scene)
         with stages.run("charts") as told:
             vertices = settings.storage == "vertices"
-            atlas = vertex_atlas(scene) if vertices else make_atlas(scene, settings, device, told)
+            atlas = vertex_atlas(scene) if vertices else make_atlas(scene, settings, device, told, OTHERWISE)
         if atlas.count == 0:
             raise SceneError(NO_SURFACE)
         with stages.run("rays") as told:

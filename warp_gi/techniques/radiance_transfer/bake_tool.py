@@ -10,15 +10,15 @@ from warp_gi.baking import Bake
 from warp_gi.errors import OptionError, check_whole
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.bake_tool import BakeTool, Rows, Table, times
+from warp_gi.techniques.bake_tool import BakeTool, ExportRequest, Rows, Table, times
 from warp_gi.techniques.radiance_transfer import export as export_files
 from warp_gi.techniques.radiance_transfer import pictures
-from warp_gi.techniques.radiance_transfer.atlas import check_surfaces
-from warp_gi.techniques.radiance_transfer.densities import check_texel_sets
 from warp_gi.techniques.radiance_transfer.estimator import RadianceTransfer
 from warp_gi.techniques.radiance_transfer.pca import CHANNELS
 from warp_gi.techniques.radiance_transfer.textures import transfer_textures
 from warp_gi.techniques.radiance_transfer.viewer import page
+from warp_gi.techniques.shared.atlas.build import check_surfaces
+from warp_gi.techniques.shared.atlas.densities import check_texel_sets
 
 
 class RadianceTransferTool(BakeTool[RadianceTransfer]):
@@ -71,9 +71,9 @@ class RadianceTransferTool(BakeTool[RadianceTransfer]):
         """Return the files that ``export`` writes."""
         return list(export_files.exported_files(path).values())
 
-    def export(self, bake: Bake, path: Path, scene: Scene, components: int) -> list[Path]:
+    def export(self, bake: Bake, path: Path, scene: Scene, request: ExportRequest[RadianceTransfer]) -> list[Path]:
         """Write images, surfaces and their description."""
-        return export_files.export_textures(bake, path, scene, components)
+        return export_files.export_textures(bake, path, scene, request.components)
 
     def check_view(self, settings: RadianceTransfer, path: Path) -> None:
         """Raise OptionError unless the file is an .html, and the bake is one of texels."""

@@ -18,10 +18,10 @@ from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import whole_scene
 from warp_gi.stateful import Service
 from warp_gi.techniques.radiance_transfer.bake import bake_transfer, transfer_key
-from warp_gi.techniques.radiance_transfer.densities import parse_texel_sets
 from warp_gi.techniques.radiance_transfer.settings import TransferSettings
 from warp_gi.techniques.radiance_transfer.sky import SkyLight, TransferLight
 from warp_gi.techniques.radiance_transfer.state import TransferState, needs_rays, transfer_state
+from warp_gi.techniques.shared.atlas.densities import parse_texel_sets
 from warp_gi.techniques.shared.lamps import lamps_move
 
 if TYPE_CHECKING:

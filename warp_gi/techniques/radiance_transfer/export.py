@@ -19,14 +19,15 @@ from warp_gi.baking import Bake
 from warp_gi.errors import OptionError
 from warp_gi.files import replacing
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.radiance_transfer.gltf_export import GENERATOR, glb
 from warp_gi.techniques.radiance_transfer.pca import CompressedBounces, compress_bounces
-from warp_gi.techniques.radiance_transfer.textures import LIGHT_NUMBERS, Atlas, TransferTextures, transfer_textures
+from warp_gi.techniques.radiance_transfer.textures import LIGHT_NUMBERS, TransferTextures, transfer_textures
+from warp_gi.techniques.shared.atlas.gltf import generator_of, glb
 from warp_gi.techniques.shared.exports import check_own
 from warp_gi.techniques.shared.exr_parts import Part, write_exr_parts
 from warp_gi.techniques.shared.octahedral_atlas import warn_if_too_large
 
 FORMAT = "warp_gi transfer textures"
+"""What all files say that they are."""
 FORMAT_VERSION = 1
 SIDES = ("front", "back")
 MASK = ("Y",)
@@ -134,13 +135,10 @@ def check_export_name(path: str | Path) -> None:
 def _says_so(file: Path) -> bool:
     if file.suffix == ".json":
         return bool(json.loads(file.read_text())["format"] == FORMAT)
+    if file.suffix == ".glb":
+        return generator_of(file) == FORMAT
     with open(file, "rb") as opened:
-        head = opened.read(HEAD)
-        if file.suffix == ".glb":  # 12 bytes of header, then the length of the JSON chunk, its type and itself
-            opened.seek(20)
-            said = json.loads(opened.read(int.from_bytes(head[12:16], "little")))
-            return bool(said["asset"]["generator"] == GENERATOR)
-    return DIGEST.encode() in head
+        return DIGEST.encode() in opened.read(HEAD)
 
 
 def page_images(
@@ -186,17 +184,6 @@ def _image(values: np.ndarray, slots: np.ndarray, shape: tuple[int, int]) -> np.
     return image.reshape(*shape, -1)
 
 
-def page_coordinates(atlas: Atlas, faces: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where points (u, v) of faces are, each [point]: their page, and coordinates in it, float32 [point, 2].
-
-    They are those of ``TransferFile.irradiance``; page -1 where a face has none.
-    """
-    pages, corners = atlas.face_pages[faces], atlas.corners[faces]
-    weights = np.stack([1.0 - u - v, u, v], axis=-1)[..., None]
-    sizes = atlas.pages[np.maximum(pages, 0), 1:]
-    return pages, ((corners * weights).sum(axis=1) / sizes).astype(np.float32)
-
-
 def export_textures(bake: Bake, path: str | Path, scene: Scene, components: int = 0) -> list[Path]:
     """Write transfer textures as NAME.exr, NAME.rgba.exr, NAME.glb and NAME.json; return the paths, the JSON file last.
 
@@ -220,7 +207,7 @@ def export_textures(bake: Bake, path: str | Path, scene: Scene, components: int 
     files = exported_files(path)
     description = files.pop("description")
     digest = {DIGEST: bake.digest}
-    surfaces = glb(scene, textures.atlas)
+    surfaces = glb(scene, textures.atlas, FORMAT)
     with ExitStack() as stack:  # it renames in reverse: the description last
         text = stack.enter_context(replacing(description))
         parts = {name: stack.enter_context(replacing(file)) for name, file in files.items()}

@@ -10,13 +10,14 @@ import numpy as np
 import warp as wp
 
 from warp_gi import launch
-from warp_gi.kernels import transfer_atlas as atlas_kernels
+from warp_gi.kernels import atlas as atlas_kernels
 from warp_gi.kernels import transfer_bake as kernels
 from warp_gi.kernels import types
+from warp_gi.kernels.atlas_slots import AtlasSlots
 from warp_gi.launch import on_device
 from warp_gi.scene.scene import Scene
 from warp_gi.techniques.radiance_transfer.settings import TransferSettings
-from warp_gi.techniques.radiance_transfer.textures import Atlas
+from warp_gi.techniques.shared.atlas.atlas import Atlas
 
 Progress = Callable[[float], None]
 """Called with the share of the work that is done."""
@@ -30,9 +31,9 @@ class TransferWork:
 
     data: types.SceneData
     """The scene, but rays meet only what never moves."""
-    atlas: atlas_kernels.TransferAtlas
+    atlas: atlas_kernels.SurfaceAtlas
     """Where the slots are on surfaces."""
-    slots: kernels.TransferSlots
+    slots: AtlasSlots
     """The surfaces at the slots."""
     rays: kernels.TransferRays
     """Directions of rays, and how many there are."""
@@ -70,13 +71,8 @@ def transfer_work(scene: Scene, atlas: Atlas, settings: TransferSettings, device
     bvh = scene.static_bvh(device)
     data = launch.copied(scene.data(device), types.SceneData)
     data.bvh = bvh.data
-    slots = kernels.TransferSlots()
-    slots.faces = on_device(atlas.slot_faces, wp.int32, device)
-    slots.points = on_device(atlas.slot_points, wp.vec2, device)
-    slots.sides = on_device(atlas.slot_sides, wp.uint8, device)
-    return TransferWork(
-        data, atlas.on(device), slots, transfer_rays(scene, settings, device, seed), atlas.count, device
-    )
+    rays = transfer_rays(scene, settings, device, seed)
+    return TransferWork(data, atlas.on(device), atlas.slots_on(device), rays, atlas.count, device)
 
 
 def transfer_rays(scene: Scene, settings: TransferSettings, device: wp.Device, seed: int) -> kernels.TransferRays:

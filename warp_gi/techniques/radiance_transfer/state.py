@@ -13,8 +13,8 @@ from warp_gi.kernels.transfer_light import TransferRows
 from warp_gi.kernels.transfer_products import LIGHT_WIDTH, WIDTHS
 from warp_gi.launch import get_device, on_device
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.radiance_transfer.atlas import can_be_charted
 from warp_gi.techniques.radiance_transfer.textures import transfer_textures
+from warp_gi.techniques.shared.atlas.build import can_be_charted
 
 LINE = 64
 """Bytes of a cache line."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.radiance_transfer.atlas import can_be_charted, scene_parts
-from warp_gi.techniques.radiance_transfer.textures import Atlas
+from warp_gi.techniques.shared.atlas.atlas import Atlas
+from warp_gi.techniques.shared.atlas.build import can_be_charted, scene_parts
 
 INWARDS = 1e-3
 """Weights of a face's other corners in the place of a slot: exactly at the foot of a wall rays would miss the wall."""

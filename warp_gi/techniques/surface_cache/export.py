@@ -38,7 +38,9 @@ def check_export_name(path: Path) -> None:
     An export to hall.ply also writes hall.json; over an earlier export it may write.
     """
     if path.suffix.lower() != ".ply":
-        raise OptionError(f"cannot export to {path.name}: the cells of a surface cache are points in a .ply file")
+        raise OptionError(
+            f"cannot export to {path.name}: expected .ply for points, or .glb, .gltf or .exr for a light map"
+        )
     check_own((path, path.with_suffix(".json")), _says_so)
 
 

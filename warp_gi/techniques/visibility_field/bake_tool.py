@@ -8,7 +8,7 @@ from warp_gi.baking import Bake
 from warp_gi.errors import OptionError
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.bake_tool import BakeTool, Rows, times
+from warp_gi.techniques.bake_tool import BakeTool, ExportRequest, Rows, times
 from warp_gi.techniques.visibility_field import export as export_files
 from warp_gi.techniques.visibility_field import pictures
 from warp_gi.techniques.visibility_field.estimator import VisibilityField
@@ -45,7 +45,7 @@ class VisibilityFieldTool(BakeTool[VisibilityField]):
         """Raise OptionError unless the file is a .png or .exr."""
         export_files.check_export_name(path)
 
-    def export(self, bake: Bake, path: Path, scene: Scene, components: int) -> list[Path]:
+    def export(self, bake: Bake, path: Path, scene: Scene, request: ExportRequest[VisibilityField]) -> list[Path]:
         """Write the masks as textures."""
         return export_files.export_textures(bake, path)
 

@@ -27,11 +27,12 @@ from warp_gi.scene import harmonics
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.environment import Environment
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.radiance_transfer.textures import Atlas, TransferTextures, transfer_textures
+from warp_gi.techniques.radiance_transfer.textures import TransferTextures, transfer_textures
 from warp_gi.techniques.radiance_transfer.viewer import pages, skies, surfaces
 from warp_gi.techniques.radiance_transfer.viewer.pages import Rows
 from warp_gi.techniques.radiance_transfer.viewer.parts import Parts
 from warp_gi.techniques.radiance_transfer.viewer.surfaces import Surfaces
+from warp_gi.techniques.shared.atlas.atlas import Atlas
 
 _LOG = logging.getLogger("warp_gi")
 FOLDER = Path(__file__).parent

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from warp_gi.techniques.radiance_transfer.pca import compress_bounces
-from warp_gi.techniques.radiance_transfer.textures import LIGHT_NUMBERS, Atlas, TransferTextures
+from warp_gi.techniques.radiance_transfer.textures import LIGHT_NUMBERS, TransferTextures
+from warp_gi.techniques.shared.atlas.atlas import Atlas
 
 DIRECT_LAYERS = 7
 """Layers of T: 25 numbers; red, green and blue of lamps fill the last of them."""

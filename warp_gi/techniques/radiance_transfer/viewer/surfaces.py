@@ -11,8 +11,8 @@ import numpy as np
 
 from warp_gi.scene.model import Material, Texture
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.radiance_transfer.textures import Atlas
 from warp_gi.techniques.radiance_transfer.viewer.pages import faces_kept
+from warp_gi.techniques.shared.atlas.atlas import Atlas
 
 IMAGE_QUALITY = 88
 """Quality of embedded images, of 100; alpha is kept as it is."""

@@ -16,7 +16,7 @@ BACK = wp.constant(1)
 
 
 @wp.struct
-class TransferAtlas:
+class SurfaceAtlas:
     corners: wp.array2d(dtype=wp.vec2)  # [face, 3] in texels of the face's page
     face_pages: wp.array(dtype=wp.int32)  # [face], -1 for faces without texels
     pages: wp.array(dtype=wp.vec3i)  # first texel, width, height
@@ -45,7 +45,7 @@ def side_seen(scene: SceneData, face: wp.int32, direction: wp.vec3) -> wp.int32:
 
 # The point (u, v) of a face in texels of its page.
 @wp.func
-def atlas_point(atlas: TransferAtlas, face: wp.int32, u: wp.float32, v: wp.float32) -> wp.vec2:
+def atlas_point(atlas: SurfaceAtlas, face: wp.int32, u: wp.float32, v: wp.float32) -> wp.vec2:
     return atlas.corners[face, 0] * (1.0 - u - v) + atlas.corners[face, 1] * u + atlas.corners[face, 2] * v
 
 
@@ -66,7 +66,7 @@ def kept_slots(slots: wp.vec4i, shares: wp.vec4) -> SlotFetch:
 
 # Where to read transfer at the point (u, v) of a face: bilinear between texels, or linear between vertices.
 @wp.func
-def atlas_fetch(atlas: TransferAtlas, face: wp.int32, u: wp.float32, v: wp.float32, side: wp.int32) -> SlotFetch:
+def atlas_fetch(atlas: SurfaceAtlas, face: wp.int32, u: wp.float32, v: wp.float32, side: wp.int32) -> SlotFetch:
     if atlas.corner_slots.shape[0] > 0:
         c = atlas.corner_slots[side, face]
         return kept_slots(wp.vec4i(c[0], c[1], c[2], -1), wp.vec4(1.0 - u - v, u, v, 0.0))
@@ -95,7 +95,7 @@ def atlas_fetch(atlas: TransferAtlas, face: wp.int32, u: wp.float32, v: wp.float
 
 # The one slot nearest to the point (u, v) of a face, or -1 where nothing is kept.
 @wp.func
-def atlas_nearest(atlas: TransferAtlas, face: wp.int32, u: wp.float32, v: wp.float32, side: wp.int32) -> wp.int32:
+def atlas_nearest(atlas: SurfaceAtlas, face: wp.int32, u: wp.float32, v: wp.float32, side: wp.int32) -> wp.int32:
     if atlas.corner_slots.shape[0] > 0:
         c = atlas.corner_slots[side, face]
         w = 1.0 - u - v

@@ -6,10 +6,10 @@ tile have at most a texel away along each axis: just those texels are touched by
 
 import warp as wp
 
+from warp_gi.kernels.atlas import FRONT, side_seen
 from warp_gi.kernels.bvh import bvh_intersect
 from warp_gi.kernels.sampling import OWN_DIMENSION, cosine_direction, frame_of, sample_2d
 from warp_gi.kernels.surface import ray_offset
-from warp_gi.kernels.transfer_atlas import FRONT, side_seen
 from warp_gi.kernels.types import Bvh, SceneData
 
 wp.set_module_options({"enable_backward": False})
@@ -19,7 +19,7 @@ INSIDE = wp.constant(0.1)  # share of the way to the centre of its face from whi
 
 
 @wp.struct
-class TransferTiles:
+class AtlasTiles:
     pages: wp.array(dtype=wp.vec4i)  # [tile] page's width and height in texels, and the tile's first texel in the page
     starts: wp.array(dtype=wp.int32)  # [tile + 1] first entry of each tile in faces
     faces: wp.array(dtype=wp.int32)  # rising in each tile
@@ -27,7 +27,7 @@ class TransferTiles:
 
 
 @wp.struct
-class TransferTexels:
+class AtlasTexels:
     faces: wp.array(dtype=wp.int32)  # [tile * TILE * TILE] nearest face, -1 where none is near
     points: wp.array(dtype=wp.vec2)  # barycentric coordinates u, v of the nearest point
 
@@ -83,7 +83,7 @@ def nearest_point(a: wp.vec2, b: wp.vec2, c: wp.vec2) -> wp.vec3:
 # Thread: a texel, TILE * TILE of them a tile, row by row. Writes the nearest face and the point on it; of faces equally
 # near the lowest.
 @wp.kernel
-def find_texel_faces(first: wp.int32, tiles: TransferTiles, texels: TransferTexels):
+def find_texel_faces(first: wp.int32, tiles: AtlasTiles, texels: AtlasTexels):
     item = first + wp.tid()
     tile = item / (TILE * TILE)
     place = item % (TILE * TILE)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pygltflib
@@ -13,7 +15,7 @@ from warp_gi.errors import BakeError
 from warp_gi.scene.files.gltf_materials import WRAP_MODES
 from warp_gi.scene.model import Material, Texture
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.radiance_transfer.textures import Atlas
+from warp_gi.techniques.shared.atlas.atlas import Atlas
 
 FLOAT, UINT = 5126, 5125
 """Component types of glTF."""
@@ -24,8 +26,6 @@ TEXTURES = {
     "normal_texture": "normalTexture",
     "emission_texture": "emissiveTexture",
 }
-GENERATOR = "warp_gi transfer textures"
-"""What the files say that they were made by."""
 _PNG_LEVEL = 3  # of 9: a third of the time for a twentieth more bytes
 
 
@@ -96,20 +96,21 @@ def drawn_triangles(scene: Scene, atlas: Atlas) -> Iterator[DrawnTriangles]:
         )
 
 
-def glb(scene: Scene, atlas: Atlas) -> bytes:
+def glb(scene: Scene, atlas: Atlas, generator: str, extras: dict[str, str] | None = None) -> bytes:
     """Return a scene at time 0 as a binary glTF file, whose TEXCOORD_1 are the coordinates in the atlas.
 
     A node for each page ("page 0", with the page in its extras), in which there is a primitive for each material;
-    faces without a page are in the node "no page". Raises BakeError for an atlas of another scene.
+    faces without a page are in the node "no page". ``generator`` is what the file says that it was made by,
+    ``extras`` are those of its scene. Raises BakeError for an atlas of another scene.
     """
-    writer = _Writer(pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator=GENERATOR), scene=0))
+    writer = _Writer(pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator=generator), scene=0))
     document = writer.document
     document.materials = [writer.material(material) for material in scene.materials]
     for drawn in drawn_triangles(scene, atlas):
         name = "no page" if drawn.page < 0 else f"page {drawn.page}"
         if not document.nodes or document.nodes[-1].name != name:
-            extras = {"page": drawn.page} if drawn.page >= 0 else {}
-            document.nodes.append(pygltflib.Node(name=name, mesh=len(document.meshes), extras=extras))
+            page = {"page": drawn.page} if drawn.page >= 0 else {}
+            document.nodes.append(pygltflib.Node(name=name, mesh=len(document.meshes), extras=page))
             document.meshes.append(pygltflib.Mesh(name=name))
         attributes = pygltflib.Attributes()
         for attribute, field in ATTRIBUTES.items():
@@ -118,8 +119,19 @@ def glb(scene: Scene, atlas: Atlas) -> bytes:
         indices = writer.accessor(drawn.indices.reshape(-1), UINT, "SCALAR", pygltflib.ELEMENT_ARRAY_BUFFER)
         primitive = pygltflib.Primitive(attributes=attributes, indices=indices, material=drawn.material)
         document.meshes[-1].primitives.append(primitive)
-    document.scenes = [pygltflib.Scene(name=scene.name, nodes=list(range(len(document.nodes))))]
+    document.scenes = [pygltflib.Scene(name=scene.name, nodes=list(range(len(document.nodes))), extras=extras or {})]
     return writer.whole()
+
+
+def generator_of(file: Path) -> str:
+    """Return what a .glb or .gltf file says that it was made by. What a file that is none raises is any error."""
+    with open(file, "rb") as opened:
+        head = opened.read(20)  # the header, then the length of the JSON chunk and its type
+        if head[:4] == b"glTF":
+            said = json.loads(opened.read(int.from_bytes(head[12:16], "little")))
+        else:
+            said = json.loads(head + opened.read())
+    return str(said["asset"]["generator"])
 
 
 class _Writer:

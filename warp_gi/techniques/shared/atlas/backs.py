@@ -6,10 +6,10 @@ import numpy as np
 import warp as wp
 
 from warp_gi import launch
-from warp_gi.kernels import transfer_gbuffer as kernels
+from warp_gi.kernels import atlas_texels as kernels
 from warp_gi.launch import on_device
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.radiance_transfer.texels import CoveredTexels
+from warp_gi.techniques.shared.atlas.texels import CoveredTexels
 
 RAYS = 4
 """Rays from the back of each slot."""

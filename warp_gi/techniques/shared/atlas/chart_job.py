@@ -39,8 +39,10 @@ class ChartJob:
     The worker has the system end it after so much CPU time. Where the system cannot, as on Windows, wall time counts.
     """
 
-    def __init__(self, seconds: float) -> None:
+    def __init__(self, seconds: float, otherwise: str = "") -> None:
         self.limit = seconds
+        self.otherwise = otherwise
+        """What can be done without charts, as the end of an error's advice; "" if nothing can."""
         self.used = 0.0
         """CPU seconds of the jobs so far."""
 
@@ -58,13 +60,18 @@ class ChartJob:
                 return arrays
         if is_late:
             raise OptionError(
-                f"xatlas took longer than chart_seconds={self.limit:g} to make charts; give chart_seconds more or 0 (no"
-                ' limit), take the meshes\' own uv (charts="own"), or keep transfer at vertices (storage="vertices")'
+                f"xatlas took longer than chart_seconds={self.limit:g} to make charts; "
+                + self.advice("give chart_seconds more or 0 (no limit)", 'take the meshes\' own uv (charts="own")')
             )
         raise OptionError(
-            f"making charts by xatlas failed ({complaint or f'exit code {code}'}); take the meshes' own uv"
-            ' (charts="own"), or keep transfer at vertices (storage="vertices")'
+            f"making charts by xatlas failed ({complaint or f'exit code {code}'}); "
+            + self.advice('take the meshes\' own uv (charts="own")')
         )
+
+    def advice(self, *ways: str) -> str:
+        """Return several ways out, and ``otherwise``, as "one, another, or a third"."""
+        *first, last = [*ways, *filter(None, [self.otherwise])]
+        return f"{', '.join(first)}, or {last}" if first else last
 
 
 def _worked_off(folder: Path, seconds: float, progress: Progress | None) -> tuple[int, bool, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal, Protocol
 
 import numpy as np
 import warp as wp
@@ -11,15 +12,14 @@ from warp_gi.errors import OptionError, SceneError
 from warp_gi.launch import get_device
 from warp_gi.scene.model import Mesh
 from warp_gi.scene.scene import Scene
-from warp_gi.techniques.radiance_transfer.backs import open_charts
-from warp_gi.techniques.radiance_transfer.buried import off_edges
-from warp_gi.techniques.radiance_transfer.charts import ChartJob, Page, cut_charts, packed, surface_sized
-from warp_gi.techniques.radiance_transfer.densities import density_factors
-from warp_gi.techniques.radiance_transfer.islands import islands
-from warp_gi.techniques.radiance_transfer.own_uvs import why_unfit
-from warp_gi.techniques.radiance_transfer.settings import TransferSettings
-from warp_gi.techniques.radiance_transfer.texels import covered_texels
-from warp_gi.techniques.radiance_transfer.textures import Atlas
+from warp_gi.techniques.shared.atlas.atlas import Atlas
+from warp_gi.techniques.shared.atlas.backs import open_charts
+from warp_gi.techniques.shared.atlas.buried import off_edges
+from warp_gi.techniques.shared.atlas.charts import ChartJob, Page, cut_charts, packed, surface_sized
+from warp_gi.techniques.shared.atlas.densities import density_factors
+from warp_gi.techniques.shared.atlas.islands import islands
+from warp_gi.techniques.shared.atlas.own_uvs import why_unfit
+from warp_gi.techniques.shared.atlas.texels import covered_texels
 
 Progress = Callable[[float], None]
 
@@ -28,12 +28,35 @@ CUT_SHARE, PACKED_SHARE, COVERED_SHARE = 0.8, 0.9, 0.95
 """Shares of the whole that are done when charts are cut, packed, and their texels known."""
 
 
-def make_atlas(scene: Scene, settings: TransferSettings, device: str, progress: Progress | None = None) -> Atlas:
+class AtlasSettings(Protocol):
+    """What decides an atlas; techniques have it among their settings."""
+
+    @property
+    def resolution(self) -> int:
+        """Texels along the longer side of the page."""
+
+    @property
+    def texel_sets(self) -> str:
+        """Densities of meshes: "auto", "one" density for all, or "NAME=FACTOR,..." by name of node or mesh."""
+
+    @property
+    def charts(self) -> Literal["auto", "xatlas", "own"]:
+        """Where uv come from: "auto" takes a mesh's own where they are fit, "own" demands it."""
+
+    @property
+    def chart_seconds(self) -> float:
+        """Seconds of CPU time that xatlas may take; 0 is no limit."""
+
+
+def make_atlas(
+    scene: Scene, settings: AtlasSettings, device: str, progress: Progress | None = None, otherwise: str = ""
+) -> Atlas:
     """Return the atlas of the surfaces that rest, as they are at time 0: one page of about ``resolution``^2 texels.
 
     Faces that move, and those without an area, are on no page. Each texel that a bilinear fetch inside a face touches
     has a slot, on the nearest point of the chart; and another on the back where the chart's back is in the open.
-    ``progress`` is called with the share that is done. The same scene and settings give the same atlas, bit by bit.
+    ``progress`` is called with the share that is done; ``otherwise`` is what can be done without an atlas, for errors.
+    The same scene and settings give the same atlas, bit by bit.
 
     Raises OptionError where charts take longer than ``chart_seconds`` or do not fit, for meshes whose own uv are
     demanded and unfit, and for unknown names in ``texel_sets``; SceneError where everything moves.
@@ -42,7 +65,7 @@ def make_atlas(scene: Scene, settings: TransferSettings, device: str, progress: 
     points = flat.points[flat.indices].astype(np.float64)
     parts, meshes = scene_parts(scene)
     kept = np.flatnonzero(can_be_charted(points) & (parts >= 0))
-    page = _page(scene, settings, points[kept], parts[kept], flat.uvs[flat.indices[kept]], meshes, progress)
+    page = _page(scene, settings, points[kept], parts[kept], flat.uvs[flat.indices[kept]], meshes, progress, otherwise)
     on_page = kept[page.charts >= 0]
     corners = np.zeros((len(points), 3, 2), np.float32)
     corners[on_page] = page.corners[page.charts >= 0]
@@ -55,12 +78,13 @@ def make_atlas(scene: Scene, settings: TransferSettings, device: str, progress: 
 
 def _page(
     scene: Scene,
-    settings: TransferSettings,
+    settings: AtlasSettings,
     points: np.ndarray,
     parts: np.ndarray,
     uvs: np.ndarray,
     meshes: list[tuple[str, Mesh]],
     progress: Progress | None,
+    otherwise: str,
 ) -> Page:
     """Return the charts of the faces with corners ``points`` [face, 3, 3] and ``uvs`` [face, 3, 2] on a page."""
     sides = points[:, 1:] - points[:, :1]
@@ -72,7 +96,7 @@ def _page(
         np.bincount(parts, minlength=len(meshes)),
         settings.resolution**2,
     )
-    job = ChartJob(settings.chart_seconds)
+    job = ChartJob(settings.chart_seconds, otherwise)
     has_own = _own_charts(settings.charts, parts, uvs, areas, meshes)[parts]
     charts = np.empty(len(points), np.int32)
     uvs = uvs.copy()

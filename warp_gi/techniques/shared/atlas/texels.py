@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from warp_gi import launch
-from warp_gi.kernels import transfer_gbuffer as kernels
+from warp_gi.kernels import atlas_texels as kernels
 from warp_gi.launch import on_device
 
 TILE = int(kernels.TILE)
@@ -34,13 +34,13 @@ def covered_texels(corners: np.ndarray, face_pages: np.ndarray, pages: np.ndarra
     tile_pages, tile_starts, faces = _binned(corners, face_pages, pages)
     used = np.flatnonzero(np.diff(tile_starts))
     starts = np.append(tile_starts[used], tile_starts[-1]).astype(np.int32)
-    tiles = kernels.TransferTiles()
+    tiles = kernels.AtlasTiles()
     tiles.pages = on_device(np.ascontiguousarray(tile_pages[used, :4]), wp.vec4i, device)
     tiles.starts = on_device(starts, wp.int32, device)
     tiles.faces = on_device(faces, wp.int32, device)
     tiles.corners = on_device(corners, wp.vec2, device)
     count = len(used) * TILE * TILE
-    found = kernels.TransferTexels()
+    found = kernels.AtlasTexels()
     found.faces = wp.empty(count, dtype=wp.int32, device=device)
     found.points = wp.empty(count, dtype=wp.vec2, device=device)
     launch.launch(kernels.find_texel_faces, count, [tiles, found], device)

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_gi.files import replacing
-from warp_gi.techniques.radiance_transfer.chart_job import WORKER
+from warp_gi.techniques.shared.atlas.chart_job import WORKER
 
 FORMAT = "warp_gi charts 1"
 """Changes with what a job's arrays mean. Charts by another version of xatlas, or of the worker, are made again, too."""

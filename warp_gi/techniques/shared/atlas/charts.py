@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from warp_gi.errors import OptionError
-from warp_gi.techniques.radiance_transfer.chart_cache import cached
-from warp_gi.techniques.radiance_transfer.chart_job import ChartJob, Progress
-from warp_gi.techniques.radiance_transfer.islands import equal_rows, islands
+from warp_gi.techniques.shared.atlas.chart_cache import cached
+from warp_gi.techniques.shared.atlas.chart_job import ChartJob, Progress
+from warp_gi.techniques.shared.atlas.islands import equal_rows, islands
 
 TRIANGLE_SIZE = 64.0
 """Root of the mean area of a part's triangles as xatlas gets them: it drops those with an area below 1e-7."""
@@ -167,19 +167,18 @@ def packed(uvs: np.ndarray, charts: np.ndarray, size: int, job: ChartJob, progre
     arrays = {"uvs": uvs, "charts": charts, "size": np.array(size)}
     result = cached("page", arrays, lambda: job.run(arrays, progress))
     if not result["page"].any():
-        raise OptionError(_too_many(count, size, int(result["least"])))
+        raise OptionError(_too_many(count, size, int(result["least"]), job))
     width, height = (int(n) for n in result["page"])
     return Page(result["corners"], np.where(result["is_placed"], charts, -1).astype(np.int32), width, height)
 
 
-def _too_many(count: int, size: int, least: int) -> str:
+def _too_many(count: int, size: int, least: int, job: ChartJob) -> str:
     """Return what to do about charts that do not fit on a page of ``size``; the smallest that was tried took ``least``.
 
     Charts of a texel or two take about that much, however small they are. A page of twice the side has about half of
     its texels to share out by area.
     """
     wanted = -(-2 * least // STEP) * STEP
-    return (
-        f"resolution {size} is too small for the {count:,} charts of this scene: take about {wanted}, give the meshes"
-        ' uv of their own in few charts (charts="own"), or keep transfer at vertices (storage="vertices")'
+    return f"resolution {size} is too small for the {count:,} charts of this scene: " + job.advice(
+        f"take about {wanted}", 'give the meshes uv of their own in few charts (charts="own")'
     )
