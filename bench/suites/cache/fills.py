@@ -36,7 +36,12 @@ def cells_row(view: CacheView, **settings: int) -> Row:
     bake = view.bake(gi.SurfaceCache(**settings))[0]
     one, other = (view.cached(SPP, SEED + 10 + turn, **settings).picture for turn in range(2))
     mean = float(view.reference.mean(dtype=float))
-    row: Row = {"cells": bake.counts["cells"], "cell m": float(bake.arrays["side"][0])}
+    row: Row = {"cells": bake.counts["cells"], "cell m": side_of(bake)}
     row |= {"samples a cell": bake.counts["samples"] / max(bake.counts["cells"], 1)}
     row |= {"MB": table_nbytes(bake.arrays["keys"]) / 1e6}
     return row | {"floor": mean_product(one, other, view.halves) ** 0.5 / mean}
+
+
+def side_of(bake: gi.Bake) -> float:
+    """Return the side of a cell near the camera in metres, as it was given."""
+    return round(float(bake.arrays["side"][0]), 6)

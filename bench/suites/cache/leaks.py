@@ -5,6 +5,7 @@ from __future__ import annotations
 import warp_gi as gi
 from warp_gi.bench.harness.measure import Row
 from warp_gi.bench.harness.path_views import room_views
+from warp_gi.bench.suites.cache.fills import side_of
 from warp_gi.bench.suites.cache.views import QUICK_SIZE, SIZE, SPP, CacheView
 
 LEAKS = "leaks: two_rooms"
@@ -22,7 +23,7 @@ def leak_rows(quick: bool, device: str) -> list[Row]:
         bake = views["lit"].bake(gi.SurfaceCache(cell=cell))[0]
         stages = {name: view.cached(SPP, cell=cell) for name, view in views.items()}
         means = {name: float(stage.picture.mean(dtype=float)) for name, stage in stages.items()}
-        row: Row = {"table": LEAKS, "cell m": float(bake.arrays["side"][0])}
+        row: Row = {"table": LEAKS, "cell m": side_of(bake)}
         row |= {"dark / lit": means["dark"] / means["lit"], "lit / paths": means["lit"] / paths}
         rows.append(row | {"most dark": MOST_DARK if cell <= CELLS[1] else ""})
     return rows
