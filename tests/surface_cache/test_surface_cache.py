@@ -111,7 +111,7 @@ def test_both_sides_of_a_sheet():
     np.testing.assert_allclose(light[~below], np.tile([3.0, 2.0, 1.0], ((~below).sum(), 1)), rtol=1e-5)
 
 
-@pytest.mark.parametrize("settings", [{}, {"capacity": 2000}, {"paths": 2000}])
+@pytest.mark.parametrize("settings", [{}, {"cell": 0.1}, {"capacity": 2000}, {"paths": 2000}])
 @pytest.mark.filterwarnings("ignore:the surface cache is full")
 def test_thin_walls_keep_light_in(settings):
     """Of two rooms with a wall of 2 cm between them, both in one bake, the dark one stays at 1 % of the lit one.

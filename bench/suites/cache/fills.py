@@ -23,7 +23,7 @@ def fill_rows(case: CacheCase, view: CacheView, turns: int, quick: bool) -> list
     rows = [row | cells_row(view) | {"most fill s": MOST_FILL, "most floor": case.floor}]
     for paths in QUICK_PATHS if quick else PATHS:
         with one_thread():
-            seconds = [timed_bake(view.scene, gi.SurfaceCache(paths=paths), view.device, view.camera)[1][1]]
+            seconds = [view.bake(gi.SurfaceCache(paths=paths))[1][1]]
         quality = view.quality(view.cached(SPP, paths=paths).picture)
         row = {"table": BY_PATHS, "case": case.name, "paths": paths, "spp": SPP, "fill cpu s": seconds[0]}
         row |= cells_row(view, paths=paths)

@@ -59,7 +59,7 @@ def place_rows(
     mean = float(view.reference.mean(dtype=np.float64))
     noise = float(np.mean(np.square(a - b, dtype=np.float64))) ** 0.5 / 2 / mean
     turns = 1 if quick else TURNS
-    rows = renderer_rows(case, view, turns, gallery) + fill_rows(case, view, turns, quick)
+    rows = fill_rows(case, view, turns, quick) + renderer_rows(case, view, turns, gallery)
     row: Row = {"table": REFERENCE, "case": case.name, "reference spp": 2 * reference_spp}
     row |= {"noise": noise, "FLIP of its halves": gi.metrics.flip(a, b)}
     return [*rows, row]

@@ -39,9 +39,9 @@ _CACHE = Region(
     "160x90, one thread. The reference is the path tracer's, and its noise is not in the errors, but in FLIP.",
     (
         Text(
-            'RMSE is over the mean of the reference. "Times less" is the CPU time that `BsdfPaths` needs for the error '
-            "that the cache has with {spp} samples, over the cache's; the fill is apart. {mean} times in the geometric "
-            "mean.",
+            '"Mean" is the cache\'s over that of the reference, which RMSE is over, too. "Times less" is the CPU time '
+            "that `BsdfPaths` needs for the error that the cache has with {spp} samples, over the cache's; the fill is "
+            "apart. {mean} times in the geometric mean.",
             {"spp": Figure("spp", {"renderer": CACHE, "spp": SPP}, table=LIGHT), "mean": Figure("faster, cpu")},
             ALL,
         ),
@@ -49,9 +49,7 @@ _CACHE = Region(
             "scene",
             "case",
             (
-                _column(
-                    "mean over paths'", "mean / paths", CACHE, digits=3, at_least="least mean", at_most="most mean"
-                ),
+                _column("mean", "mean / paths", CACHE, digits=3, at_least="least mean", at_most="most mean"),
                 _column(f"RMSE of {FEW}, %: paths", "RMSE / mean", PATHS, FEW, scale=100.0),
                 _column("cache", "RMSE / mean", CACHE, FEW, scale=100.0),
                 _column(f"of {SPP}, %: paths", "RMSE / mean", PATHS, scale=100.0),
@@ -87,8 +85,8 @@ _CACHE = Region(
             "{black} % of the pixels are black where paths find light. The dark one of `two_rooms` has {dark} % of the "
             "light of the lit one, behind a wall of 2 cm, and {large} % with cells of 0.25 m. "
             f"With `residual={CORRECTED}` "
-            "the mean is {mean} of the path tracer's, and paths take {residual} times as long for the same error. Fills "
-            "of fewer and more paths:",
+            "the mean is {mean} of the path tracer's, and paths take {residual} times as long for the same error. "
+            "Fills of fewer and more paths:",
             {
                 "black": Figure("black pixels", {"renderer": CACHE}, scale=100.0, table=LIGHT),
                 "dark": Figure("dark / lit", {"cell m": 0.1}, 2, 100.0, at_most="most dark"),
@@ -109,7 +107,7 @@ HEADLINES = (
         "SurfaceCache",
         "ends paths in small cells of surfaces that know all light there",
         Text(
-            "{faster} times less CPU time for indirect light than paths of the same error, after {fill} CPU s of filling",
+            "{faster} times less CPU time for indirect light than paths of the same error; a fill takes {fill} CPU s",
             {"faster": _of("faster, cpu", CACHE), "fill": _fill("fill cpu s")},
             LIGHT,
         ),
