@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import warp_gi as gi
 from warp_gi import launch
+from warp_gi.bench import cache_pictures
 from warp_gi.bench.harness import path_views, places
 from warp_gi.bench.harness.gallery import Gallery
 from warp_gi.bench.publish.figures import headlines_text, region_text
@@ -101,3 +103,15 @@ def test_places_whose_files_are_missing_are_one_row(monkeypatch, tmp_path):
     monkeypatch.setattr(light, "CASES", tuple(case for case in views.CASES if case.missing))
     rows = light.light_rows(False, "cpu")
     assert len(rows) == 4 and all("WARP_GI_SCENES" in row["skipped"] for row in rows)
+
+
+def test_pictures_are_one_sheet_and_missing_places_are_passed_over(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(places.scenes, "SCENES", tmp_path)
+    monkeypatch.setattr(cache_pictures, "SHOWN", ("cornell_box", "sponza"))
+    monkeypatch.setattr(cache_pictures, "SIZE", (24, 16))
+    file = tmp_path / "sheet.jpg"
+    assert cache_pictures.main(["-o", str(file), "--samples", "4", "--reference-samples", "8"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in said] == ["sponza:", "wrote"] and "WARP_GI_SCENES" in said[0]
+    assert Image.open(file).size == (3 * 28 - 4, 16 + 24)
+    assert cache_pictures.main(["-o", str(tmp_path), "--samples", "0"]) == 2
