@@ -199,10 +199,13 @@ SHEETS = {
 
 
 def drawn(rows: list[Row]) -> np.ndarray:
-    """Return rows of pictures with their labels, each row in the exposure of its last, uint8 [height, width, 3]."""
+    """Return rows of pictures of one size with their labels, each row in the exposure of its last.
+
+    The sheet is uint8 [height, width, 3].
+    """
     from PIL import Image, ImageDraw
 
-    width, height = SIZE
+    height, width = rows[0][0][1].shape[:2]
     across, down = width + GAP, height + LABEL
     sheet = Image.new("RGB", (across * max(map(len, rows)) - GAP, down * len(rows)), (255, 255, 255))
     draw = ImageDraw.Draw(sheet)

@@ -132,7 +132,7 @@ def test_cells_under_many_lamps_hold_the_sum_of_their_light():
     assert np.sqrt(((found - wanted) ** 2).mean()) < 0.2 * wanted.mean()  # 0.96 by power alone
 
 
-@pytest.mark.parametrize("settings", [{}, {"capacity": 2000}, {"paths": 2000}])
+@pytest.mark.parametrize("settings", [{}, {"cell": 0.1}, {"capacity": 2000}, {"paths": 2000}])
 @pytest.mark.filterwarnings("ignore:the surface cache is full")
 def test_thin_walls_keep_light_in(settings):
     """Of two rooms with a wall of 2 cm between them, both in one bake, the dark one stays at 1 % of the lit one.

@@ -13,9 +13,10 @@ import numpy as np
 
 from warp_gi.bench.harness.gallery import CLOSED, Gallery, PictureSet
 from warp_gi.bench.harness.measure import Row
+from warp_gi.bench.harness.path_views import SEED, black_share, mean_squared
 from warp_gi.bench.harness.stages import Case, Stage, race
 from warp_gi.bench.suites.probes.irradiance import of_probes, path_traced
-from warp_gi.bench.suites.probes.views import SEED, ProbeView, counts_of, mean_squared, room_views, view_of
+from warp_gi.bench.suites.probes.views import ProbeView, counts_of, room_views, view_of
 
 TERM_TABLE = "default settings, the scenes' own materials"
 DARK_TABLE = "default settings: dark room of two"
@@ -27,8 +28,6 @@ MOST_BAKE = 40.0
 """Largest number of CPU seconds that a bake may take."""
 DARK_TARGETS = {"probes": 0.015, "exact": 0.006}
 """Targets for the light of the dark room over that of the lit one, by visibility."""
-TOO_DARK = 0.05
-"""Share of the reference's mean above which a pixel of the reference must not be 0 in ours."""
 
 
 @dataclass(frozen=True)
@@ -95,12 +94,6 @@ def term_rows(
 def _grid_row(stage: Stage) -> Row:
     spacing = float(stage.state.grid.spacing.max())
     return {"probes": counts_of(stage), "resolution": stage.state.resolution, "spacing m": spacing}
-
-
-def black_share(picture: np.ndarray, reference: np.ndarray) -> float:
-    """Return the share of pixels that are exactly 0 although the reference is not: above ``TOO_DARK`` of its mean."""
-    lit = reference.mean(axis=-1) > TOO_DARK * reference.mean()
-    return float((lit & (picture.max(axis=-1) <= 0)).mean())
 
 
 def dark_rows(views: dict[str, ProbeView], **settings: Any) -> list[Row]:

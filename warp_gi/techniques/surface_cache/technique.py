@@ -11,5 +11,6 @@ TECHNIQUE = Technique(
     presets={"cache": {"indirect": ("BsdfPaths", {"ends_in": "SurfaceCache"})}},
     samplers=("surface_cache.SURFACE_CACHE",),
     bake_tool="bake_tool",
+    suite="cache",
     page="techniques/surface_cache.md",
 )
