@@ -23,8 +23,8 @@ from warp_gi.kernels.bvh import BvhHit, bvh_intersect, bvh_occluded
 from warp_gi.kernels.emitters import may_hit_emitter, triangle_light_pdf
 from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, tiled_pixel
 from warp_gi.kernels.light_connections import (
+    connect_direction,
     connect_emitter,
-    connect_sky,
     explore_2d,
     explore_3d,
     light_1d,
@@ -285,18 +285,20 @@ def _made(
                 s = with_color(scene, s)
             # light sampling; after the ray above, which gives memory the time to answer the prefetches
             if wants_sky:
-                sky_sample = connect_sky(scene, s, wo, sky.sample(samplers.sky, scene, u_sky))
-                if sky_sample.arrives != 0:
-                    pdf = directions.pdf(samplers.directions, region, s, sky_sample.direction, sky_sample.bsdf_pdf)
-                    pdf = sky_sample.pdf * sky_share + pdf
-                    light = sky_sample.reflected / pdf
-                    if path >= wp.int64(0):
-                        weight = wp.cw_mul(throughput, sky_sample.scattered / pdf)
-                        sky.leave(samplers.sky, path, depth, sky_sample.direction, weight)
-                    if at_first:
-                        r.environment = light
-                    else:
-                        r.indirect = r.indirect + wp.cw_mul(throughput, light)
+                sky_sample = sky.sample(samplers.sky, scene, u_sky)
+                way = connect_direction(scene, s, wo, sky_sample.direction)
+                if way.arrives != 0:
+                    source = sky.arrival(samplers.sky, scene, sky_sample)
+                    if source.pdf > 0.0:
+                        pdf = directions.pdf(samplers.directions, region, s, way.direction, way.bsdf_pdf)
+                        scattered = way.scattered / (source.pdf * sky_share + pdf)
+                        light = wp.cw_mul(scattered, source.radiance)
+                        if path >= wp.int64(0):
+                            sky.leave(samplers.sky, path, depth, way.direction, wp.cw_mul(throughput, scattered))
+                        if at_first:
+                            r.environment = light
+                        else:
+                            r.indirect = r.indirect + wp.cw_mul(throughput, light)
             if wants_emitter:
                 choice = lights.choose(samplers.lights, scene, region, s, wo, u_select)
                 u_point = light_2d(index, seed, d + EMITTER_DIMENSION, at_first)

@@ -72,7 +72,12 @@ def transfer_sample(data: Transfer, scene: SceneData, u: wp.vec3) -> Environment
     ring = wp.sqrt(wp.max(0.0, 1.0 - z * z))
     angle = 2.0 * wp.pi * u[1]
     direction = wp.vec3(ring * wp.cos(angle), ring * wp.sin(angle), z)
-    return EnvironmentSample(direction, UNIFORM_SPHERE_PDF, wp.vec3(0.0, 0.0, 0.0))
+    return EnvironmentSample(direction, 0, 0, 0.0, 0.0)
+
+
+@wp.func
+def transfer_arrival(data: Transfer, scene: SceneData, e: EnvironmentSample) -> EnvironmentLookup:
+    return EnvironmentLookup(wp.vec3(0.0, 0.0, 0.0), UNIFORM_SPHERE_PDF)
 
 
 @wp.func
@@ -103,6 +108,7 @@ TRANSFER_SKY = Sky(
     transfer_is_sampled,
     transfer_prefetch,
     transfer_sample,
+    transfer_arrival,
     transfer_lookup,
     transfer_radiance,
     transfer_leave,
