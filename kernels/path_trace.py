@@ -79,6 +79,8 @@ TERM_ENVIRONMENT = wp.constant(1)
 TERM_EMITTERS = wp.constant(2)
 TERM_INDIRECT = wp.constant(4)
 NO_PATH = wp.constant(wp.int64(-1))  # number of a path of which nothing is kept
+SURVIVAL = wp.constant(wp.float32(1.4))  # of roulette, times the reflectance that a path met after its first vertex
+LEAST_SURVIVAL = wp.constant(wp.float32(0.05))
 CACHE_VERTEX = wp.constant(2)  # PathSettings.cache_vertex unless asked for another one: after one traced bounce
 
 
@@ -184,6 +186,7 @@ def _made(
         throughput = wp.vec3(1.0, 1.0, 1.0)
         # the same by the BSDF alone: roulette must not end paths for going where light was expected, which lowers it
         reflected = wp.vec3(1.0, 1.0, 1.0)
+        first_reflected = float(1.0)
         samples_sky = sky.is_sampled(samplers.sky, scene)
         sharpness = float(wp.inf)
         corrects = bool(False)
@@ -328,6 +331,8 @@ def _made(
             carried = luminance(throughput)
             throughput = wp.cw_mul(throughput, sample_weight(s.bsdf, b.weight))
             reflected = wp.cw_mul(reflected, sample_weight(s.bsdf, b.reflected))
+            if at_first:
+                first_reflected = wp.max(reflected)
             if hit.face < 0:
                 if at >= 0 and not ends:
                     regions.direction(samplers.regions, at, b, 0.0, carried, luminance(r.environment + r.indirect))
@@ -362,8 +367,10 @@ def _made(
             vertices += 1
             if is_last:
                 break
+            # A pixel is as bright as its first vertex reflects, and noise counts by that: so the first vertex cancels.
             if depth >= paths.roulette_depth:
-                survival = wp.min(wp.max(wp.max(throughput), wp.max(reflected)), 0.95)
+                survival = SURVIVAL * wp.max(reflected) / wp.max(first_reflected, 1.0e-30)
+                survival = wp.clamp(survival, LEAST_SURVIVAL, 1.0)
                 if random_1d(index, seed, d + ROULETTE_DIMENSION) >= survival:
                     break
                 throughput = throughput / survival
