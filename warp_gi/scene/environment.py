@@ -48,7 +48,7 @@ class SkyMap:
 
     def __init__(self, pixels: np.ndarray) -> None:
         self.pixels = pixels
-        self.arrays: dict[str, tuple[wp.array, wp.array, float]] = {}
+        self.arrays: dict[str, tuple[wp.array, wp.array, wp.array]] = {}
         self.watch: Watch | None = None
         self._derived: dict[Hashable, Any] = {}
 
