@@ -540,6 +540,44 @@ def test_learners_get_no_light_of_a_lobe_that_is_traced_alone():
     assert not lights[:, 1:].any() and not directions[:, 1:].any()
 
 
+# ---- roulette ----
+
+
+def survivals(albedo: float, roulette_depth: int, vertices: int) -> np.ndarray:
+    """Return the probabilities that a path has a vertex 0, 1, ... in a closed room, float64 [vertices]."""
+    there, met = [1.0], 1.0
+    for depth in range(2, vertices + 1):
+        if depth > 2:
+            met *= albedo
+        survival = min(max(1.4 * met, 0.05), 1.0) if depth >= roulette_depth else 1.0
+        there.append(there[-1] * survival)
+        met /= survival
+    return np.array(there)
+
+
+@pytest.mark.parametrize("albedo, roulette_depth", [(0.6, 2), (0.6, 4), (0.9, 2), (0.02, 2)])
+def test_paths_survive_by_what_they_met_after_the_first_vertex(albedo, roulette_depth):
+    spp, vertices = 32, 8
+    scene = furnace(albedo)
+    scene.nodes[0].meshes[0].material.base_color = (0.1 * albedo, albedo, 0.5 * albedo)  # the largest counts
+    begun: list[wp.array] = []
+
+    def fill(samplers: Any, items: int) -> None:
+        log = samplers.regions
+        log.vertices = vertices
+        arrays = [wp.zeros(items * spp * vertices, dtype=wp.int32, device=device()) for _ in range(3)]
+        log.begun, log.lights, log.directions = arrays
+        log.before = wp.zeros(items * spp * vertices, dtype=wp.float32, device=device())
+        log.ends = wp.zeros(items * spp, dtype=wp.float32, device=device())
+        begun.append(log.begun)
+
+    trace(gi.Scene(scene.nodes), camera_inside(), LOGGED, fill, spp=spp, roulette_depth=roulette_depth)
+    there = begun[0].numpy().reshape(-1, vertices).mean(axis=0)
+    expected = survivals(albedo, roulette_depth, vertices)
+    sigma = np.sqrt(expected * (1 - expected) / (256 * spp))
+    assert (np.abs(there - expected) < 4.5 * sigma + 2e-4).all(), (there, expected)  # rays graze an edge and end
+
+
 # ---- one tracer for one combination ----
 
 
