@@ -417,7 +417,7 @@ def test_a_lobe_that_a_cache_does_not_know_is_traced():
             mesh.material.metallic, mesh.material.specular, mesh.material.roughness = 1.0, 1.0, 0.5
     scene = gi.Scene(scene.nodes, environment=low_sky())
     known, found = (
-        np.stack([trace(scene, camera, tracer, make, spp=16, seed=seed)["indirect"] for seed in range(16)])
+        np.stack([trace(scene, camera, tracer, make, spp=16, seed=seed)["indirect"] for seed in range(24)])
         for tracer, make in ((REFERENCE, None), (LOBES, fill))
     )
     expected, variance = st.mean_and_variance(known.mean(axis=(1, 2)))
