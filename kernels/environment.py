@@ -1,9 +1,10 @@
 """The sky: radiance in a direction, sampling directions by it, and the pdf of doing so.
 
 A map's texel (row i, column j) is a node at v = i / (height - 1), u = (j + 0.5) / width, and radiance
-is bilinear between nodes; the first row is the zenith, the last the nadir. Sampling picks a patch between four
-nodes, then a point in it by the luminance there. So the density per latitude and longitude is the luminance, times
-the sine of the polar angle in the middle of the patch; only that sine, and colours, make samples differ in weight.
+is bilinear between nodes; the first row is the zenith, the last the nadir. A bilinear luminance is a sum of tents
+about nodes: sampling picks a node, then a point under its tent, and reads no texel for it. So the density per latitude
+and longitude is the luminance, times the sine of the polar angle in the middle of the patch between four nodes; only
+that sine, and colours, make samples differ in weight.
 """
 
 import warp as wp
@@ -20,11 +21,15 @@ TWO_PI = wp.constant(wp.float32(6.283185307179586))
 UNIFORM_SPHERE_PDF = wp.constant(wp.float32(0.07957747154594767))  # 1 / (4 pi)
 
 
+# A direction, and of a map where in it that is: `environment_arrival` knows the rest. Most samples lie behind the
+# surface or in shadow, and need no more.
 @wp.struct
 class EnvironmentSample:
-    direction: wp.vec3  # unit, world space, towards the sky
-    pdf: wp.float32  # 1/sr; 0 if there is nothing to sample
-    radiance: wp.vec3  # W/(m^2 sr)
+    direction: wp.vec3  # unit, world space, towards the sky; 0 if there is nothing to sample
+    row: wp.int32  # of the patch's upper nodes
+    column: wp.int32  # of its left nodes, may be -1
+    s: wp.float32  # from left to right
+    t: wp.float32  # from upper to lower
 
 
 @wp.struct
@@ -102,12 +107,10 @@ def polar_angle(row: wp.int32, t: wp.float32, height: wp.int32) -> wp.vec2:
     return wp.vec2(-below[0], below[1])
 
 
-# Density [1/sr] of a direction that is `sine` away from the poles' axis, in a patch's row. `pdf_scale` is one over the
-# integral of luminance over latitude and longitude, times the sines in the middle of rows.
+# Density [1/sr] of a direction that is `sine` away from the poles' axis, in a patch's row.
 @wp.func
 def patch_pdf(env: Environment, row: wp.int32, texel: wp.vec3, sine: wp.float32) -> wp.float32:
-    middle = polar_angle(row, 0.5, env.height)[1]
-    return luminance(texel) * env.pdf_scale * middle / wp.max(sine, 1.0e-12)
+    return luminance(texel) * env.row_pdfs[row + 1] / wp.max(sine, 1.0e-12)
 
 
 # Radiance [W/(m^2 sr)] from a unit direction in world space.
@@ -137,49 +140,56 @@ def environment_lookup(env: Environment, direction: wp.vec3) -> EnvironmentLooku
     return r
 
 
-# Where a density that goes from a to b, in a straight line over [0, 1], has the share u below.
-@wp.func
-def sample_linear(a: wp.float32, b: wp.float32, u: wp.float32) -> wp.float32:
-    scale = 1.0 / wp.max(wp.max(a, b), 1.0e-38)  # squares of radiances could be beyond what a float32 holds
-    low = a * scale
-    high = b * scale
-    root = wp.sqrt(wp.lerp(low * low, high * high, u))
-    return wp.min(u * (low + high) / wp.max(low + root, 1.0e-30), 1.0)
-
-
 # A direction by the luminance from there, from three uniform numbers in [0, 1): u[0] with further digits u[2] picks a
-# patch and then the azimuth in it, u[1] the polar angle.
+# node and then the azimuth under its tent, u[1] the polar angle.
 @wp.func
 def environment_sample(env: Environment, u: wp.vec3) -> EnvironmentSample:
-    result = EnvironmentSample()
+    r = EnvironmentSample()
     if env.kind == ENVIRONMENT_MAP:
-        choice = alias_choice(env.alias, env.width * (env.height - 1), u[0], u[2])
-        row = choice.item / env.width
-        column = choice.item - row * env.width
-        patch = patch_nodes(env, row, column)
-        left = wp.vec2(luminance(patch.upper_left), luminance(patch.lower_left))
-        right = wp.vec2(luminance(patch.upper_right), luminance(patch.lower_right))
-        patch.t = sample_linear(left[0] + right[0], left[1] + right[1], u[1])
-        patch.s = sample_linear(
-            wp.lerp(left[0], left[1], patch.t), wp.lerp(right[0], right[1], patch.t), choice.remainder
-        )
-        texel = patch_texel(patch)
-        polar = polar_angle(row, patch.t, env.height)
-        around = circle((wp.float32(column) + 0.5 + patch.s) / wp.float32(env.width)) * polar[1]
+        choice = alias_choice(env.alias, env.width * env.height, u[0], u[2])
+        r.row = choice.item / env.width
+        r.column = choice.item - r.row * env.width
+        if choice.remainder < 0.5:
+            r.column -= 1
+            r.s = wp.sqrt(2.0 * choice.remainder)
+        else:
+            r.s = 1.0 - wp.sqrt(2.0 - 2.0 * choice.remainder)
+        above = env.row_pdfs[r.row]
+        share = above / (above + env.row_pdfs[r.row + 1])
+        if u[1] < share:
+            r.row -= 1
+            r.t = wp.sqrt(u[1] / share)
+        else:
+            r.t = 1.0 - wp.sqrt((1.0 - u[1]) / (1.0 - share))
+        polar = polar_angle(r.row, r.t, env.height)
+        around = circle((wp.float32(r.column) + 0.5 + r.s) / wp.float32(env.width)) * polar[1]
         local = wp.vec3(around[1], polar[0], -around[0])
-        result.direction = wp.transpose(env.environment_from_world) * local
-        result.radiance = wp.cw_mul(texel, env.radiance)
-        result.pdf = patch_pdf(env, row, texel, polar[1])
+        r.direction = wp.transpose(env.environment_from_world) * local
     elif env.kind == ENVIRONMENT_CONSTANT:
         z = 1.0 - 2.0 * u[1]
-        r = wp.sqrt(wp.max(0.0, 1.0 - z * z))
-        result.direction = wp.vec3(r * wp.cos(TWO_PI * u[0]), z, r * wp.sin(TWO_PI * u[0]))
-        result.radiance = env.radiance
-        result.pdf = UNIFORM_SPHERE_PDF
-    return result
+        ring = wp.sqrt(wp.max(0.0, 1.0 - z * z))
+        r.direction = wp.vec3(ring * wp.cos(TWO_PI * u[0]), z, ring * wp.sin(TWO_PI * u[0]))
+    return r
+
+
+# What comes from the direction of a sample, and the density of such samples: as environment_lookup says of it.
+@wp.func
+def environment_arrival(env: Environment, e: EnvironmentSample) -> EnvironmentLookup:
+    r = EnvironmentLookup()
+    if env.kind == ENVIRONMENT_MAP:
+        patch = patch_nodes(env, e.row, e.column)
+        patch.s = e.s
+        patch.t = e.t
+        texel = patch_texel(patch)
+        r.radiance = wp.cw_mul(texel, env.radiance)
+        r.pdf = patch_pdf(env, e.row, texel, polar_angle(e.row, e.t, env.height)[1])
+    elif env.kind == ENVIRONMENT_CONSTANT:
+        r.radiance = env.radiance
+        r.pdf = UNIFORM_SPHERE_PDF
+    return r
 
 
 # Starts fetching what environment_sample(env, u) will read first.
 @wp.func
 def environment_prefetch(env: Environment, u: wp.vec3):
-    alias_prefetch(env.alias, env.width * (env.height - 1), u[0])
+    alias_prefetch(env.alias, env.width * env.height, u[0])

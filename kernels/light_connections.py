@@ -5,7 +5,7 @@ import warp as wp
 from warp_gi.kernels.bsdf import bsdf_evaluate
 from warp_gi.kernels.bvh import bvh_occluded
 from warp_gi.kernels.emitters import LightChoice, sample_emitter
-from warp_gi.kernels.environment import EnvironmentSample
+from warp_gi.kernels.environment import EnvironmentSample, environment_arrival
 from warp_gi.kernels.sampling import (
     EXPLORE_DIGITS_DIMENSION,
     EXPLORE_DIMENSION,
@@ -29,29 +29,40 @@ SHADOW_END = wp.constant(wp.float32(0.9999))  # share of the way to an emitter t
 class LightConnection:
     arrives: wp.int32  # 1; 0 or, of an emitter with something in between, -1: it does not, and nothing else is set
     direction: wp.vec3
-    reflected: wp.vec3  # f cos(wi) times the radiance (over the pdf already where `delta`)
-    scattered: wp.vec3  # f cos(wi); of samples of the sky alone
-    pdf: wp.float32  # of the light sample
+    reflected: wp.vec3  # f cos(wi) times the radiance (over the pdf already where `delta`); not of a mere direction
+    scattered: wp.vec3  # f cos(wi); not of emitters
+    pdf: wp.float32  # of the light sample; not of a mere direction
     bsdf_pdf: wp.float32
     delta: wp.int32
 
 
+# Whether light from far away arrives from a unit direction. What it is needs to be known of the few alone that do.
 @wp.func
-def connect_sky(scene: SceneData, s: Surface, wo: wp.vec3, e: EnvironmentSample) -> LightConnection:
+def connect_direction(scene: SceneData, s: Surface, wo: wp.vec3, direction: wp.vec3) -> LightConnection:
     r = LightConnection()
-    if e.pdf <= 0.0 or wp.dot(e.direction, s.normal) <= 0.0:
+    if wp.dot(direction, s.normal) <= 0.0:
         return r
-    f = bsdf_evaluate(s.bsdf, wo, wp.transpose(s.shading) * e.direction)
+    f = bsdf_evaluate(s.bsdf, wo, wp.transpose(s.shading) * direction)
     if f.pdf <= 0.0:
         return r
-    if bvh_occluded(scene.bvh, ray_origin(s), e.direction, float(wp.inf)):
+    if bvh_occluded(scene.bvh, ray_origin(s), direction, float(wp.inf)):
         return r
     r.arrives = 1
-    r.direction = e.direction
-    r.reflected = wp.cw_mul(f.value, e.radiance)
+    r.direction = direction
     r.scattered = f.value
-    r.pdf = e.pdf
     r.bsdf_pdf = f.pdf
+    return r
+
+
+@wp.func
+def connect_sky(scene: SceneData, s: Surface, wo: wp.vec3, e: EnvironmentSample) -> LightConnection:
+    r = connect_direction(scene, s, wo, e.direction)
+    if r.arrives != 0:
+        source = environment_arrival(scene.environment, e)
+        if source.pdf <= 0.0:
+            return LightConnection()
+        r.reflected = wp.cw_mul(r.scattered, source.radiance)
+        r.pdf = source.pdf
     return r
 
 

@@ -17,6 +17,7 @@ from warp_gi.kernels.emitters import LightChoice
 from warp_gi.kernels.environment import (
     EnvironmentLookup,
     EnvironmentSample,
+    environment_arrival,
     environment_lookup,
     environment_prefetch,
     environment_radiance,
@@ -89,6 +90,7 @@ class Sky(NamedTuple):
     is_sampled: wp.Function
     prefetch: wp.Function  # (data, scene, u: vec3): called ahead of `sample` with the same numbers
     sample: wp.Function  # (data, scene, u: vec3) -> EnvironmentSample
+    arrival: wp.Function  # (data, scene, EnvironmentSample) -> EnvironmentLookup: asked if nothing stands in between
     lookup: wp.Function  # (data, scene, direction) -> EnvironmentLookup, whose pdf is that of `sample`
     radiance: wp.Function  # (data, scene, direction) -> that of `lookup` alone, for camera rays that hit nothing
     # (data, path: int64, edges of the path from the camera to the sky: 2 is direct light, direction, weight: vec3)
@@ -285,6 +287,11 @@ def scene_sky_sample(data: SceneSky, scene: SceneData, u: wp.vec3) -> Environmen
 
 
 @wp.func
+def scene_sky_arrival(data: SceneSky, scene: SceneData, e: EnvironmentSample) -> EnvironmentLookup:
+    return environment_arrival(scene.environment, e)
+
+
+@wp.func
 def scene_sky_lookup(data: SceneSky, scene: SceneData, direction: wp.vec3) -> EnvironmentLookup:
     return environment_lookup(scene.environment, direction)
 
@@ -330,6 +337,7 @@ SCENE_SKY = Sky(
     scene_sky_is_sampled,
     scene_sky_prefetch,
     scene_sky_sample,
+    scene_sky_arrival,
     scene_sky_lookup,
     scene_sky_radiance,
     leave_no_record,

@@ -23,8 +23,8 @@ from warp_gi.kernels.bvh import BvhHit, bvh_intersect, bvh_occluded
 from warp_gi.kernels.emitters import may_hit_emitter, triangle_light_pdf
 from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, tiled_pixel
 from warp_gi.kernels.light_connections import (
+    connect_direction,
     connect_emitter,
-    connect_sky,
     explore_2d,
     explore_3d,
     light_1d,
@@ -79,6 +79,8 @@ TERM_ENVIRONMENT = wp.constant(1)
 TERM_EMITTERS = wp.constant(2)
 TERM_INDIRECT = wp.constant(4)
 NO_PATH = wp.constant(wp.int64(-1))  # number of a path of which nothing is kept
+SURVIVAL = wp.constant(wp.float32(1.4))  # of roulette, times the reflectance that a path met after its first vertex
+LEAST_SURVIVAL = wp.constant(wp.float32(0.05))
 CACHE_VERTEX = wp.constant(2)  # PathSettings.cache_vertex unless asked for another one: after one traced bounce
 
 
@@ -184,6 +186,7 @@ def _made(
         throughput = wp.vec3(1.0, 1.0, 1.0)
         # the same by the BSDF alone: roulette must not end paths for going where light was expected, which lowers it
         reflected = wp.vec3(1.0, 1.0, 1.0)
+        first_reflected = float(1.0)
         samples_sky = sky.is_sampled(samplers.sky, scene)
         sharpness = float(wp.inf)
         corrects = bool(False)
@@ -285,18 +288,20 @@ def _made(
                 s = with_color(scene, s)
             # light sampling; after the ray above, which gives memory the time to answer the prefetches
             if wants_sky:
-                sky_sample = connect_sky(scene, s, wo, sky.sample(samplers.sky, scene, u_sky))
-                if sky_sample.arrives != 0:
-                    pdf = directions.pdf(samplers.directions, region, s, sky_sample.direction, sky_sample.bsdf_pdf)
-                    pdf = sky_sample.pdf * sky_share + pdf
-                    light = sky_sample.reflected / pdf
-                    if path >= wp.int64(0):
-                        weight = wp.cw_mul(throughput, sky_sample.scattered / pdf)
-                        sky.leave(samplers.sky, path, depth, sky_sample.direction, weight)
-                    if at_first:
-                        r.environment = light
-                    else:
-                        r.indirect = r.indirect + wp.cw_mul(throughput, light)
+                sky_sample = sky.sample(samplers.sky, scene, u_sky)
+                way = connect_direction(scene, s, wo, sky_sample.direction)
+                if way.arrives != 0:
+                    source = sky.arrival(samplers.sky, scene, sky_sample)
+                    if source.pdf > 0.0:
+                        pdf = directions.pdf(samplers.directions, region, s, way.direction, way.bsdf_pdf)
+                        scattered = way.scattered / (source.pdf * sky_share + pdf)
+                        light = wp.cw_mul(scattered, source.radiance)
+                        if path >= wp.int64(0):
+                            sky.leave(samplers.sky, path, depth, way.direction, wp.cw_mul(throughput, scattered))
+                        if at_first:
+                            r.environment = light
+                        else:
+                            r.indirect = r.indirect + wp.cw_mul(throughput, light)
             if wants_emitter:
                 choice = lights.choose(samplers.lights, scene, region, s, wo, u_select)
                 u_point = light_2d(index, seed, d + EMITTER_DIMENSION, at_first)
@@ -326,6 +331,8 @@ def _made(
             carried = luminance(throughput)
             throughput = wp.cw_mul(throughput, sample_weight(s.bsdf, b.weight))
             reflected = wp.cw_mul(reflected, sample_weight(s.bsdf, b.reflected))
+            if at_first:
+                first_reflected = wp.max(reflected)
             if hit.face < 0:
                 if at >= 0 and not ends:
                     regions.direction(samplers.regions, at, b, 0.0, carried, luminance(r.environment + r.indirect))
@@ -360,8 +367,10 @@ def _made(
             vertices += 1
             if is_last:
                 break
+            # A pixel is as bright as its first vertex reflects, and noise counts by that: so the first vertex cancels.
             if depth >= paths.roulette_depth:
-                survival = wp.min(wp.max(wp.max(throughput), wp.max(reflected)), 0.95)
+                survival = SURVIVAL * wp.max(reflected) / wp.max(first_reflected, 1.0e-30)
+                survival = wp.clamp(survival, LEAST_SURVIVAL, 1.0)
                 if random_1d(index, seed, d + ROULETTE_DIMENSION) >= survival:
                     break
                 throughput = throughput / survival

@@ -85,8 +85,10 @@ class Environment:
     width: wp.int32
     height: wp.int32
     texels: wp.array(dtype=wp.vec3)  # [height * width]
-    alias: wp.array(dtype=AliasBucket)  # [(height - 1) * width] table over patches between texels
-    pdf_scale: wp.float32  # see environment.patch_pdf
+    alias: wp.array(dtype=AliasBucket)  # [height * width] table over texels, as nodes with tents about them
+    # [height + 1] between the rows of texels, and 0 beyond them: density of samples, times the sine of the polar angle,
+    # over the luminance of the texel there, 1/sr
+    row_pdfs: wp.array(dtype=wp.float32)
 
 
 @wp.struct

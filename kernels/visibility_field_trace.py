@@ -15,7 +15,7 @@ import warp as wp
 
 from warp_gi.kernels.bsdf import bsdf_evaluate, bsdf_sample, bsdf_weight
 from warp_gi.kernels.bvh import bvh_occluded
-from warp_gi.kernels.environment import environment_lookup, environment_sample
+from warp_gi.kernels.environment import environment_arrival, environment_lookup, environment_sample
 from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, tiled_pixel
 from warp_gi.kernels.harmonics import Harmonics, cosine_harmonics, harmonics, vec9
 from warp_gi.kernels.sampling import (
@@ -457,9 +457,10 @@ def sample_sky(first: wp.int32, scene: SceneData, seed: wp.uint32, sky: FieldSky
     u = sample_2d(wp.uint32(k), seed, SET_SKY_DIMENSION)
     digits = random_1d(wp.uint32(k), seed, SET_SKY_DIGITS_DIMENSION)
     e = environment_sample(scene.environment, wp.vec3(u[0], u[1], digits))
+    source = environment_arrival(scene.environment, e)
     sky.directions[k] = e.direction
-    sky.pdfs[k] = e.pdf
-    sky.radiances[k] = e.radiance
+    sky.pdfs[k] = source.pdf
+    sky.radiances[k] = source.radiance
 
 
 # Thread: a pixel. Writes its light under a low-frequency sky, from its transfers; no ray is traced.

@@ -31,7 +31,7 @@ def scene_data(scene: gi.Scene) -> Any:
 def path_settings(scene: gi.Scene, spp: int, **settings: Any) -> Any:
     """Return settings of paths that trace every term; ``settings`` replace any of them."""
     paths = path_trace.PathSettings()
-    defaults = {"terms": EVERYTHING, "max_depth": 64, "roulette_depth": 5, "sky_probability": sky_probability(scene)}
+    defaults = {"terms": EVERYTHING, "max_depth": 64, "roulette_depth": 2, "sky_probability": sky_probability(scene)}
     for name, value in {**defaults, "cache_vertex": path_trace.CACHE_VERTEX, "spp": spp, **settings}.items():
         setattr(paths, name, value)
     return paths

@@ -78,8 +78,9 @@ def test_terms_add_up_to_beauty_exactly():
 @pytest.mark.parametrize("left_out", ["environment", "emitters", "indirect"])
 def test_a_term_left_out_is_black_and_changes_no_other(left_out):
     """Up to the light of other terms that share a path: only the noise may differ, and here not even that."""
-    whole = one_frame(pipeline=gi.Pipeline(spp=4))
-    part = one_frame(pipeline=gi.Pipeline(spp=4, **{left_out: None}))
+    terms = {"emitters": gi.PowerLights()}  # by which paths pick lights if nobody says how
+    whole = one_frame(pipeline=gi.Pipeline(spp=4, **terms))
+    part = one_frame(pipeline=gi.Pipeline(spp=4, **(terms | {left_out: None})))
     for term in ("environment", "emitters", "indirect"):
         if term == left_out:
             assert not part.numpy(term).any() and whole.numpy(term).any()

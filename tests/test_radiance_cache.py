@@ -68,7 +68,7 @@ def test_the_command_line_names_a_cache_and_its_settings(tmp_path, capsys):
     for pipeline, told in {
         "path,indirect.ends_in=PowerLights": "unknown radiance cache 'PowerLights' (known: LightFieldProbes, Radiance",
         "direct,indirect.ends_in=LightFieldProbes": "got indirect=none",
-        "path,emitters.ends_in=LightFieldProbes": "got emitters=PowerLights",
+        "path,emitters.ends_in=LightFieldProbes": "got emitters=LightHierarchy",
         "path,indirect.ends=LightFieldProbes": "did you mean 'indirect.ends_in'",
     }.items():
         assert main([*command, pipeline]) == 2

@@ -60,7 +60,7 @@ class PathRequest:
         """Bits of the terms that this camera sample's estimators want, ``path_trace.TERM_*``."""
         self.max_depth = 2
         """Edges of the longest path from the camera to a light; 2 is direct light."""
-        self.roulette_depth = 5
+        self.roulette_depth = 2
         """Number of edges from which on paths end at random."""
         self.clamp = 0.0
         """Largest component of a path's indirect radiance, W/(m^2 sr); 0 is no limit."""
@@ -121,7 +121,7 @@ class PathRequest:
             )
         self.cache, self.cache_vertex = SamplerInUse(cache, data), vertex
 
-    def want(self, term: str, max_depth: int | None = None, roulette_depth: int = 5, clamp: float = 0.0) -> None:
+    def want(self, term: str, max_depth: int | None = None, roulette_depth: int = 2, clamp: float = 0.0) -> None:
         """Ask for a term of the light in the current camera sample.
 
         Args:

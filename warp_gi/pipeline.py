@@ -40,7 +40,7 @@ class Pipeline:
 
     environment: Estimator | None = _default("TracedEnvironment")
     """Estimator of direct light from the sky."""
-    emitters: Estimator | None = _default("PowerLights")
+    emitters: Estimator | None = _default("LightHierarchy")
     """Estimator of direct light from emissive triangles and punctual lights."""
     indirect: Estimator | None = _default("BsdfPaths")
     """Estimator of light that arrives over other surfaces."""

@@ -72,7 +72,12 @@ def transfer_sample(data: Transfer, scene: SceneData, u: wp.vec3) -> Environment
     ring = wp.sqrt(wp.max(0.0, 1.0 - z * z))
     angle = 2.0 * wp.pi * u[1]
     direction = wp.vec3(ring * wp.cos(angle), ring * wp.sin(angle), z)
-    return EnvironmentSample(direction, UNIFORM_SPHERE_PDF, wp.vec3(0.0, 0.0, 0.0))
+    return EnvironmentSample(direction, 0, 0, 0.0, 0.0)
+
+
+@wp.func
+def transfer_arrival(data: Transfer, scene: SceneData, e: EnvironmentSample) -> EnvironmentLookup:
+    return EnvironmentLookup(wp.vec3(0.0, 0.0, 0.0), UNIFORM_SPHERE_PDF)
 
 
 @wp.func
@@ -103,6 +108,7 @@ TRANSFER_SKY = Sky(
     transfer_is_sampled,
     transfer_prefetch,
     transfer_sample,
+    transfer_arrival,
     transfer_lookup,
     transfer_radiance,
     transfer_leave,
@@ -411,7 +417,7 @@ def test_a_lobe_that_a_cache_does_not_know_is_traced():
             mesh.material.metallic, mesh.material.specular, mesh.material.roughness = 1.0, 1.0, 0.5
     scene = gi.Scene(scene.nodes, environment=low_sky())
     known, found = (
-        np.stack([trace(scene, camera, tracer, make, spp=16, seed=seed)["indirect"] for seed in range(16)])
+        np.stack([trace(scene, camera, tracer, make, spp=16, seed=seed)["indirect"] for seed in range(24)])
         for tracer, make in ((REFERENCE, None), (LOBES, fill))
     )
     expected, variance = st.mean_and_variance(known.mean(axis=(1, 2)))
@@ -532,6 +538,44 @@ def test_learners_get_no_light_of_a_lobe_that_is_traced_alone():
     assert begun[:, 1].mean() > 0.2 and begun[:, 2].any()
     assert lights[:, 0].all() and directions[:, 0].any()
     assert not lights[:, 1:].any() and not directions[:, 1:].any()
+
+
+# ---- roulette ----
+
+
+def survivals(albedo: float, roulette_depth: int, vertices: int) -> np.ndarray:
+    """Return the probabilities that a path has a vertex 0, 1, ... in a closed room, float64 [vertices]."""
+    there, met = [1.0], 1.0
+    for depth in range(2, vertices + 1):
+        if depth > 2:
+            met *= albedo
+        survival = min(max(1.4 * met, 0.05), 1.0) if depth >= roulette_depth else 1.0
+        there.append(there[-1] * survival)
+        met /= survival
+    return np.array(there)
+
+
+@pytest.mark.parametrize("albedo, roulette_depth", [(0.6, 2), (0.6, 4), (0.9, 2), (0.02, 2)])
+def test_paths_survive_by_what_they_met_after_the_first_vertex(albedo, roulette_depth):
+    spp, vertices = 32, 8
+    scene = furnace(albedo)
+    scene.nodes[0].meshes[0].material.base_color = (0.1 * albedo, albedo, 0.5 * albedo)  # the largest counts
+    begun: list[wp.array] = []
+
+    def fill(samplers: Any, items: int) -> None:
+        log = samplers.regions
+        log.vertices = vertices
+        arrays = [wp.zeros(items * spp * vertices, dtype=wp.int32, device=device()) for _ in range(3)]
+        log.begun, log.lights, log.directions = arrays
+        log.before = wp.zeros(items * spp * vertices, dtype=wp.float32, device=device())
+        log.ends = wp.zeros(items * spp, dtype=wp.float32, device=device())
+        begun.append(log.begun)
+
+    trace(gi.Scene(scene.nodes), camera_inside(), LOGGED, fill, spp=spp, roulette_depth=roulette_depth)
+    there = begun[0].numpy().reshape(-1, vertices).mean(axis=0)
+    expected = survivals(albedo, roulette_depth, vertices)
+    sigma = np.sqrt(expected * (1 - expected) / (256 * spp))
+    assert (np.abs(there - expected) < 4.5 * sigma + 2e-4).all(), (there, expected)  # rays graze an edge and end
 
 
 # ---- one tracer for one combination ----

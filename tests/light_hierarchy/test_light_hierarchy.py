@@ -18,6 +18,7 @@ from warp_gi.kernels import types
 from warp_gi.launch import launch
 from warp_gi.scene.model import Material, Mesh, Node, PunctualLight
 from warp_gi.scene.scene import Scene
+from warp_gi.techniques.light_hierarchy import estimator
 from warp_gi.techniques.light_hierarchy.bounds import EmitterBounds, emitter_bounds
 from warp_gi.techniques.light_hierarchy.tree import TreeArrays, build_tree, refit_tree, to_device
 
@@ -558,3 +559,58 @@ def test_lights_without_power_are_never_selected():
     assert (pdfs[:, bounds.power == 0] == 0.0).all() and (pdfs[:, bounds.power > 0].max(axis=0) > 0.0).all()
     dark = build_tree(replace(bounds, power=np.zeros(20)))
     assert len(dark.child) == 0 and (all_pdfs(dark, *random_points(5, random)) == 0.0).all()
+
+
+# ---- the estimator ----
+
+
+def lamp(x: float) -> list[Mesh]:
+    """Return a square of two emissive triangles."""
+    corners = np.array([[x, 2, 0], [x, 2, 0.2], [x + 0.2, 2, 0.2], [x + 0.2, 2, 0]], np.float32)
+    shine = Material("shine", (0.0, 0.0, 0.0), emission=(5.0, 4.0, 3.0), double_sided=True)
+    return [Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), shine)]
+
+
+def lamps(squares: int, punctual: int) -> Scene:
+    """Return a floor under squares and point lights, side by side."""
+    floor = np.array([[-3, 0, -3], [-3, 0, 3], [3, 0, 3], [3, 0, -3]], np.float32)
+    meshes = [Mesh(floor, np.array([[0, 1, 2], [0, 2, 3]], np.int32), Material("floor"))]
+    for k in range(squares):
+        meshes += lamp(k - 0.5)
+    lights = [PunctualLight("point", (2.0, 3.0, 4.0), position=(-k - 0.5, 2.0, 1.0)) for k in range(punctual)]
+    return Scene([Node("all", meshes)], lights)
+
+
+@pytest.mark.parametrize("squares, punctual", [(0, 0), (1, 0), (0, 1)])
+def test_the_only_lamp_is_picked_by_power(squares, punctual):
+    """No tree, and the pictures of PowerLights bit by bit."""
+    scene = lamps(squares, punctual)
+    assert warp_gi.LightHierarchy().start(scene, device().alias) is None
+    camera = warp_gi.Camera.look_at((0, 1.5, 2.5), (0, 0, 0), resolution=(8, 8))
+    pictures = [
+        next(iter(warp_gi.render(scene, camera, warp_gi.Pipeline(spp=2, **chosen), device=device().alias)))
+        for chosen in ({}, {"emitters": warp_gi.PowerLights()})
+    ]
+    assert pictures[0].numpy("beauty").any() == (squares + punctual > 0)
+    assert np.array_equal(*(frame.numpy("beauty") for frame in pictures))
+
+
+@pytest.mark.parametrize("squares, punctual", [(2, 0), (0, 2), (1, 1)])
+def test_of_two_lamps_the_tree_picks_one(squares, punctual):
+    state = warp_gi.LightHierarchy().start(lamps(squares, punctual), device().alias)
+    assert state.tree.child_count.sum() >= 2
+
+
+def test_more_lights_than_a_tree_holds_are_picked_by_power(monkeypatch):
+    monkeypatch.setattr(estimator, "MOST_EMITTERS", 5)
+    assert warp_gi.LightHierarchy().start(lamps(2, 1), device().alias) is not None
+    assert warp_gi.LightHierarchy().start(lamps(2, 2), device().alias) is None
+
+
+def test_the_hierarchy_is_the_default():
+    presets = {name: warp_gi.Pipeline.preset(name).emitters for name in warp_gi.Pipeline.presets()}
+    learning = {name for name, one in presets.items() if isinstance(one, warp_gi.VisibilityLightCache)}
+    assert learning == {"reuse", "hybrid"} and presets["probe_view"] is None
+    rest = set(presets) - learning - {"probe_view"}
+    assert all(presets[name] == warp_gi.LightHierarchy() for name in rest)
+    assert warp_gi.Pipeline().emitters == warp_gi.LightHierarchy()

@@ -224,7 +224,7 @@ def bakes(tmp_path_factory):
         ("direct", "this bake has other settings (bounces: bake has 0, asked for 2): bake it again"),
         ("cut", "cut.safetensors: is truncated, damaged or no bake at all"),
         ("index", "does not hold transfer textures that fit together: bake again"),
-        ("technique", "a bake of VisibilityField was given, but the pipeline's estimators are: PowerLights, Radiance"),
+        ("technique", "a bake of VisibilityField was given, but the pipeline's estimators are: LightHierarchy, Ra"),
         ("none", "none.safetensors: no such file; bake first, or correct the path"),
     ],
 )

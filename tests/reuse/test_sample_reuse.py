@@ -264,12 +264,13 @@ def test_contributions_do_not_count_what_came_before():
 
 
 def test_roulette_does_not_change_what_is_expected_of_later_vertices():
-    """Paths that survive carry more, and what they bring is over that."""
+    """Paths that survive carry more, and what they bring is over that; up to the second vertex all survive."""
     plain, kept = Kept(0.3), Kept(0.3, roulette_depth=2)
-    assert kept.there[:, 1].sum() < 0.8 * plain.there[:, 1].sum()
-    both = plain.known[:, 1] & kept.known[:, 1] & ~kept.there[:, 2] & ~plain.there[:, 2]
-    assert both.sum() > 100 and (kept.carried[both, 1] > 1.05 * plain.carried[both, 1]).mean() > 0.9
-    assert np.allclose(kept.contributions[both, 1], plain.contributions[both, 1], rtol=1e-4)
+    assert np.array_equal(kept.there[:, 1], plain.there[:, 1])
+    assert kept.there[:, 2].sum() < 0.9 * plain.there[:, 2].sum()
+    both = plain.known[:, 2] & kept.known[:, 2]
+    assert both.sum() > 100 and (kept.carried[both, 2] > 1.15 * plain.carried[both, 2]).mean() > 0.9
+    assert np.allclose(kept.contributions[both, 2], plain.contributions[both, 2], rtol=1e-4)
 
 
 def test_nearness_is_of_what_is_hit():

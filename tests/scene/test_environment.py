@@ -13,6 +13,7 @@ from warp_gi.alias import AliasTable
 from warp_gi.errors import OptionError, SceneError
 from warp_gi.kernels.alias import alias_choice, alias_position
 from warp_gi.kernels.environment import (
+    environment_arrival,
     environment_lookup,
     environment_radiance,
     environment_sample,
@@ -37,9 +38,10 @@ def sample_directions(
 ):
     i = first + wp.tid()
     s = environment_sample(env, numbers[i])
+    arrival = environment_arrival(env, s)
     directions[i] = s.direction
-    radiance[i] = s.radiance
-    pdf[i] = s.pdf
+    radiance[i] = arrival.radiance
+    pdf[i] = arrival.pdf
 
 
 @wp.kernel
@@ -366,6 +368,27 @@ def test_sampled_flux_equals_the_integral(kind, device):
     error = estimate.std(0, dtype=np.float64) / math.sqrt(len(estimate))
     assert np.all(np.abs(estimate.mean(0, dtype=np.float64) - env.mean_radiance) < 4.5 * error)
     assert np.all(error < 0.002 * env.mean_radiance)  # a uniform choice would be off by far more
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("height", [2, 9, 48])
+def test_samples_over_their_pdf_integrate_as_quadrature_does(height, device):
+    """One over the pdf has the mean 4 pi where no part is black; cosine lobes have their irradiance."""
+    rng = np.random.default_rng(height)
+    pixels = (0.2 + rng.random((height, 2 * height, 3))).astype(np.float32)
+    pixels[height // 2, height] = 40.0
+    env = Environment(pixels=pixels, rotation=63.0)
+    directions, radiance, pdf = sample(env, 400_000, device)
+    axes = random_directions(8, seed=height)
+    points, areas = sphere_grid(env, max(2, 96 // height))
+    luminance = np.array([0.2126, 0.7152, 0.0722])
+    values = np.maximum(directions.astype(np.float64) @ axes.T, 0) * (radiance @ luminance)[:, None]
+    values = np.concatenate([np.ones((len(pdf), 1)), values], axis=1) / pdf[:, None].astype(np.float64)
+    lobes = np.maximum(points @ axes.T, 0) * (evaluate(env, points, device)[0] @ luminance)[:, None]
+    expected = np.concatenate([[4 * math.pi], areas @ lobes])
+    error = values.std(0) / math.sqrt(len(pdf))
+    assert np.all(np.abs(values.mean(0) - expected) < 4.5 * error + 3e-4 * expected)
+    assert np.all(error < 0.01 * expected)
 
 
 def test_rotation_turns_counter_clockwise_seen_from_above():

@@ -31,7 +31,7 @@ SKIES = {"constant": (1.0, 1.0, 1.0), "map": gi.Environment(pixels=WHITE_MAP)}
 
 
 def path(spp: int = 64, max_depth: int = 2, **settings: object) -> gi.Pipeline:
-    indirect = gi.BsdfPaths(max_depth=max_depth, roulette_depth=3) if max_depth > 2 else None
+    indirect = gi.BsdfPaths(max_depth=max_depth) if max_depth > 2 else None
     return gi.Pipeline.preset("path", spp=spp, indirect=indirect, **settings)
 
 
@@ -78,7 +78,9 @@ def test_all_is_one_radiance_in_equilibrium(sky):
     walls = [
         quad((-2, 0, -1), (4, 0, 0), (0, 1.5, 0), glow, "back wall"),
         quad((-1, 0, -1), (0, 0, 2), (0, 1, 0), glow, "side wall"),
-        sphere((0.3, 0.5, 0), 0.4, glow, rows=6),
+        replace(
+            sphere((0.3, 0.5, 0), 0.4, glow, rows=6), normals=None
+        ),  # smooth ones lose 0.1 % where cells are this large
     ]
     scene = scene_of(ground(glow), *walls, environment=SKIES[sky])
     camera = gi.Camera.look_at((0.5, 0.8, 2.5), (0, 0.5, 0), hfov=50, resolution=(24, 16))

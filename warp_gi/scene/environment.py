@@ -48,7 +48,7 @@ class SkyMap:
 
     def __init__(self, pixels: np.ndarray) -> None:
         self.pixels = pixels
-        self.arrays: dict[str, tuple[wp.array, wp.array, float]] = {}
+        self.arrays: dict[str, tuple[wp.array, wp.array, wp.array]] = {}
         self.watch: Watch | None = None
         self._derived: dict[Hashable, Any] = {}
 
@@ -81,12 +81,13 @@ class SkyMap:
 
         return self.once(("split", brighter_than, most), make)
 
-    def on(self, device: wp.Device) -> tuple[wp.array, wp.array, float]:
-        """Return texels, alias table and scale of densities, arrays on the device."""
+    def on(self, device: wp.Device) -> tuple[wp.array, wp.array, wp.array]:
+        """Return texels, alias table over them and densities by row, arrays on the device."""
         if device.alias not in self.arrays:
-            weights = _patch_weights(self.pixels)
+            weights, row_pdfs = _node_weights(self.pixels)
             texels = on_device(self.pixels.reshape(-1, 3), wp.vec3, device)
-            self.arrays[device.alias] = (texels, AliasTable.build(weights).on(device), 1.0 / weights.sum())
+            rows = on_device(row_pdfs.astype(np.float32), wp.float32, device)
+            self.arrays[device.alias] = (texels, AliasTable.build(weights).on(device), rows)
             self.watch = self.watch or Watch([(self, ("pixels", "arrays"))])
         return self.arrays[device.alias]
 
@@ -95,17 +96,19 @@ class SkyMap:
         return self.watch is not None and bool(self.watch.changes())
 
 
-def _patch_weights(pixels: np.ndarray) -> np.ndarray:
-    """Return float64 [height - 1, width]: mean luminance between four nodes times the patch's solid angle, nearly.
+def _node_weights(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return float64 [height, width]: luminance times the integral of the node's tent, and ``Environment.row_pdfs``.
 
-    Steradians are those in the middle of the row, where ``environment.patch_pdf`` counts the same.
+    Steradians are those in the middle of a row of patches, for all of the patch: ``environment.patch_pdf`` counts the
+    same. The densities are float64 [height + 1].
     """
     height, width = pixels.shape[:2]
-    value = pixels.astype(np.float64) @ LUMINANCE
-    value = 0.5 * (value + np.roll(value, -1, 1))
     step = math.pi / (height - 1)
-    area = np.sin((np.arange(height - 1) + 0.5) * step) * step * (2 * math.pi / width)
-    return 0.5 * (value[:-1] + value[1:]) * area[:, None]
+    sines = np.sin((np.arange(-1, height) + 0.5) * step)
+    sines[[0, -1]] = 0.0  # nothing lies beyond the poles
+    area = 0.5 * (sines[:-1] + sines[1:]) * step * (2 * math.pi / width)
+    weights = pixels.astype(np.float64) @ LUMINANCE * area[:, None]
+    return weights, sines / weights.sum()
 
 
 @dataclass(eq=False)
@@ -272,7 +275,7 @@ class Environment:
             result.radiance = wp.vec3(self.scale, self.scale, self.scale)
             result.height, result.width = self._map.pixels.shape[:2]
             arrays = self._map.on(target)
-            result.texels, result.alias, result.pdf_scale = arrays
+            result.texels, result.alias, result.row_pdfs = arrays
         return result
 
 

@@ -1,4 +1,4 @@
-"""Direct light from emitters that a hierarchy over them selects: the baseline of the light cache."""
+"""Direct light from emitters that a hierarchy over them selects: the default, and the baseline of the light cache."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_gi import launch
 from warp_gi.estimator import Ahead, Estimator
-from warp_gi.kernels import light_hierarchy
+from warp_gi.kernels import light_hierarchy, path_samplers
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.techniques.light_hierarchy import tree as light_tree
 from warp_gi.techniques.light_hierarchy.bounds import EmitterBounds, emitter_bounds
@@ -21,13 +21,20 @@ if TYPE_CHECKING:
     from warp_gi.scene.scene import Scene
 
 
+FEW_LAMPS = 2
+"""Fewer lamps than this are picked by power; a punctual light is a lamp, and so are two emissive triangles."""
+MOST_EMITTERS = 1 << light_hierarchy.MOST_LEVELS
+"""More emitters than this are picked by power, too: halving them makes a tree that is too deep."""
+
+
 @dataclass(frozen=True)
 class LightHierarchy(Estimator):
     """Direct light from emitters, selected at every point by distance, power and orientation. Unbiased.
 
     A tree over emitters with boxes and orientation cones, eight wide, is descended at random by importance (Conty
     Estevez and Kulla 2018, "Importance Sampling of Many Lights with Adaptive Tree Splitting", without splitting). It
-    is refit where lights move.
+    is refit where lights move. A scene's only lamp, which is one punctual light or up to three emissive triangles, is
+    sampled as by ``PowerLights``: there is nothing to choose, and that takes less time. So are more than two million.
     """
 
     term: ClassVar[str] = "emitters"
@@ -39,7 +46,9 @@ class LightHierarchy(Estimator):
     def start(
         self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0
     ) -> TreeState | None:
-        """Return the tree over the lights at time 0."""
+        """Return the tree over the lights at time 0; None where they are picked by power."""
+        if not _has_choice(scene):
+            return None
         return first_tree(scene, launch.get_device(device))
 
     def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
@@ -47,8 +56,9 @@ class LightHierarchy(Estimator):
         return False
 
     def preprocess(self, frame: Frame, state: TreeState | None) -> TreeState | None:
-        """Bring the tree up to the frame's lights, and give it to the paths."""
+        """Bring the tree up to the frame's lights and give it to the paths; without one they get the table by power."""
         if state is None:
+            frame.paths.use_lights(path_samplers.ALIAS_LIGHTS, path_samplers.AliasLights())
             return None
         state = moved_tree(frame, state)
         frame.paths.use_lights(light_hierarchy.HIERARCHY_LIGHTS, state.data)
@@ -69,6 +79,14 @@ class TreeState:
     """Bounds of the emitters that the tree's boxes and cones are around."""
     data: light_hierarchy.LightTree
     """Tree as kernels read it."""
+
+
+def _has_choice(scene: Scene | BakedScene) -> bool:
+    """Whether a scene has more than one lamp, so that different ones light points, and no more than a tree holds."""
+    if not 0 < scene.emitter_count <= MOST_EMITTERS:
+        return False
+    punctual = len(whole_scene(scene).lights)
+    return punctual + (scene.emitter_count - punctual) / 2 >= FEW_LAMPS
 
 
 def first_tree(scene: Scene | BakedScene, device: wp.Device) -> TreeState | None:

@@ -36,7 +36,7 @@ TERM_BITS = {
     "indirect": int(transfer_shade.WANTS_INDIRECT),
 }
 """Terms that transfer textures know."""
-MOST_EDGES, ROULETTE_EDGES = 64, 5
+MOST_EDGES, ROULETTE_EDGES = 64, 2
 """Edges of the longest path from what moves, and number of edges from which on paths end at random."""
 
 
