@@ -10,7 +10,8 @@ import warp as wp
 from warp_gi.kernels.atlas_slots import are_parted
 from warp_gi.kernels.bsdf import lambert, luminance
 from warp_gi.kernels.bvh import BvhHit
-from warp_gi.kernels.path_samplers import ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY
+from warp_gi.kernels.light_hierarchy import HIERARCHY_LIGHTS
+from warp_gi.kernels.path_samplers import BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY
 from warp_gi.kernels.path_trace import NO_PATH, PathSettings, path_tracer
 from warp_gi.kernels.sampling import frame_of, hash_uint
 from warp_gi.kernels.surface import Surface, ray_offset, ray_origin, shading_normal
@@ -23,7 +24,7 @@ SIDE = wp.constant(2)  # places along a side of a texel, which smooths the edges
 MOST_PLACES = wp.constant(SIDE * SIDE)  # of a texel
 DARKER = wp.constant(wp.float32(0.1))  # share of the light of the brightest place, below which another may be behind
 
-TRACER = path_tracer(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY, SURFACE_CACHE)
+TRACER = path_tracer(HIERARCHY_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY, SURFACE_CACHE)
 LightMapSamplers = TRACER.samplers
 trace_path = TRACER.trace_path
 

@@ -14,11 +14,13 @@ from warp_gi.baking import Bake
 from warp_gi.errors import OptionError, SceneError, check_whole, unknown_name
 from warp_gi.kernels import path_samplers, path_trace
 from warp_gi.kernels import surface_cache_lightmap as kernels
+from warp_gi.kernels.light_hierarchy import LightTree
 from warp_gi.kernels.surface_cache import SurfaceCells
 from warp_gi.launch import on_device
 from warp_gi.paths import sky_probability
 from warp_gi.scene.scene import Scene
 from warp_gi.techniques.bake_tool import ExportSettings
+from warp_gi.techniques.light_hierarchy.estimator import first_tree
 from warp_gi.techniques.paths.estimators import BsdfPaths
 from warp_gi.techniques.shared.atlas.atlas import Atlas, page_coordinates
 from warp_gi.techniques.shared.atlas.build import NO_SURFACE, make_atlas
@@ -141,7 +143,7 @@ def bake_light_map(
     """
     bake.check(type(cache).__name__, cache.bake_key(scene), cache.bake_settings(scene))
     target, tell = launch.get_device(device), progress or (lambda share: None)
-    cells = cache.start(scene, device, bake, seed)
+    cells = cache.start(scene, device, bake, seed).cells
     with scene.lock:
         scene.check_unchanged()
         atlas = make_atlas(scene, settings, device, lambda share: tell(ATLAS_SHARE * share))
@@ -149,11 +151,12 @@ def bake_light_map(
         if fronts == 0:
             raise SceneError(NO_SURFACE)
         data, slots = lit_data(scene, target), atlas.slots_on(target)
+        samplers = _samplers(scene, cells, target)
         inside, backs = looks_of_slots(data, atlas, slots, LOOKS, target)
         places = _places(atlas, fronts, settings.samples, seed, target)
         light = wp.zeros(fronts, dtype=wp.vec3, device=target)
         for start in range(0, fronts, BATCH):
-            inputs = [start, data, _samplers(cells), _paths(scene), places, light]
+            inputs = [start, data, samplers, _paths(scene), places, light]
             launch.launch(kernels.gather_light, min(BATCH, fronts - start), inputs, target, smallest_slice=16)
             tell(ATLAS_SHARE + (1.0 - ATLAS_SHARE) * min(start + BATCH, fronts) / fronts)
         irradiance = light.numpy()
@@ -164,9 +167,10 @@ def bake_light_map(
     return LightMap(atlas, irradiance[stands_in], is_known)
 
 
-def _samplers(cells: SurfaceCells) -> kernels.LightMapSamplers:
-    samplers = kernels.LightMapSamplers()
-    samplers.lights, samplers.directions = path_samplers.AliasLights(), path_samplers.BsdfDirections()
+def _samplers(scene: Scene, cells: SurfaceCells, device: wp.Device) -> kernels.LightMapSamplers:
+    samplers, tree = kernels.LightMapSamplers(), first_tree(scene, device)
+    samplers.lights = LightTree() if tree is None else tree.data
+    samplers.directions = path_samplers.BsdfDirections()
     samplers.regions, samplers.sky = path_samplers.NoRegions(), path_samplers.SceneSky()
     samplers.cache = cells
     return samplers
