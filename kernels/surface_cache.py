@@ -23,7 +23,7 @@ READ_LEVELS = wp.constant(2)  # that paths of a picture read: wider cells reach 
 LARGEST_LEVEL = wp.constant(10)  # of the smallest of them, so that the key has room for all
 LARGEST_COORDINATE = wp.constant((1 << 16) - 1)  # of a cell of level 0, along an axis
 MOST_OBJECTS = wp.constant((1 << 9) - 1)  # that have a grid of their own; others share grids
-NEAR = wp.constant(wp.float32(0.5))  # sides of a cell below which matt surfaces are too near to each other to read one
+NEAR = wp.constant(wp.float32(1.0))  # sides of a cell below which matt surfaces are too near to each other to read one
 LEAST_LOBE = wp.constant(wp.float32(0.3))  # probability, at least, of tracing a lobe that is not read
 
 

@@ -55,12 +55,12 @@ class SurfaceCache(RadianceCache):
     cell: float = 0.0
     """Side in metres of a cell near the camera; 0 is a hundredth of the scene's diagonal, but at most 0.15 m. Light
     leaks through walls that are much thinner."""
-    growth: float = 0.015
+    growth: float = 0.03
     """Side of a cell over its distance from the camera's path, where that is more than ``cell``."""
     capacity: int = 1 << 19
     """Largest number of cells, of 80 to 160 bytes each with the empty places of the table. Those with the fewest
     samples find no place, and a warning tells of them."""
-    traced_below: float = 0.2
+    traced_below: float = 0.4
     """Roughness below which the specular lobe of a surface where a path ends is traced by one more ray, not read."""
     residual: float = 0.0
     """Share of paths that go on where others end, and correct what cells say: with any share above 0 pictures are
