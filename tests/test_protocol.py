@@ -278,7 +278,7 @@ def test_values_of_presets_name_classes_to_any_depth(monkeypatch):
     monkeypatch.setattr(registry, "presets", lambda: known | {"clean": {**preset, "filter": "tent"}})
     clean = gi.Pipeline.preset("clean", spp=2)
     assert clean.indirect.ends_in == gi.LightFieldProbes() and clean.filter == "tent" and clean.spp == 2
-    assert clean.denoise == gi.SpatioTemporal(shrink=0.0)
+    assert clean.denoise == gi.SpatioTemporal(lag=0.0)
     assert gi.Pipeline.preset("clean", denoise=None).denoise is None
 
 
