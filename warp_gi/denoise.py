@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from warp_gi.errors import OptionError, check_whole, one_line, unknown_name
-from warp_gi.kernels import denoise
+from warp_gi.kernels import denoise, denoise_edges
 from warp_gi.stateful import Ahead, Stateful
 
 if TYPE_CHECKING:
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 __all__ = ["DENOISERS", "Denoiser", "Oidn", "SpatioTemporal"]
 
 MOST_LEVELS = 8
+CLIP = 1.5
+"""Standard deviations of the pixels around a pixel, to which the last picture is limited in it."""
 QUALITIES = ("high", "balanced", "fast")
 
 
@@ -64,6 +66,8 @@ class History:
     """Geometry and colours of the surfaces in the frame's pixels."""
     average: denoise.Signals
     """Averages over frames of diffuse and glossy light, and the number of frames in them."""
+    picture: wp.array
+    """The frame's beauty, vec3 [height * width]."""
 
     def leads_to(self, frame: Frame) -> bool:
         """Return whether the frame's motion is towards the last frame, of the same scene and size."""
@@ -115,8 +119,18 @@ class SpatioTemporal(Denoiser):
     """Standard deviations by which the light of a block of 8x8 pixels has changed when earlier frames begin to be
     forgotten; at twice as many all are. 0 never forgets."""
 
+    edge_samples: int = 4
+    """Camera samples of a pixel whose neighbours show something else, 0 to 64. They share the light of the pixels
+    around, and cost no light samples. 0 takes none."""
+    blend: float = 1.0
+    """Weight of a frame in the average of pictures, above 0 to 1 (temporal antialiasing): 0.25 flickers less and is
+    softer; 1 is no average."""
+
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
+        check_whole("edge_samples", self.edge_samples, 0, 64)
+        if not 0 < self.blend <= 1:
+            raise OptionError(f"blend must be a weight above 0 and at most 1, got {self.blend}")
         for name in ("frames", "glossy_frames"):
             check_whole(name, getattr(self, name), 1, 1024)
         for name in ("levels", "glossy_levels"):
@@ -137,8 +151,16 @@ class SpatioTemporal(Denoiser):
             average = self._accumulated(frame, settings, state, guides, average)
         filtered = self._filtered(frame, settings, guides, average, 0 if has_history else 1)
         frame.launch(denoise.put_back, [light, guides, filtered, frame["beauty"]])
+        edges = self._edges(frame)
+        if edges.samples > 0:
+            inputs = [frame.data, frame.camera_data, settings, edges, guides, filtered, frame["beauty"]]
+            frame.launch_tiled(denoise_edges.sample_edges, inputs)
+        if state is not None and has_history and self.blend < 1:
+            picture = wp.clone(frame["beauty"])
+            inputs = [settings, edges, frame["depth"], frame["motion"], picture, state.picture, frame["beauty"]]
+            frame.launch(denoise_edges.average_pictures, inputs)
         scene = (frame.scene, light_of(frame.scene))
-        return History(frame.index, frame.camera.resolution, scene, guides, average)
+        return History(frame.index, frame.camera.resolution, scene, guides, average, frame["beauty"])
 
     def _accumulated(
         self,
@@ -193,6 +215,13 @@ class SpatioTemporal(Denoiser):
         settings.lag, settings.luminance = self.lag, self.luminance
         settings.normal, settings.plane = self.normal_power, self.plane_distance
         return settings
+
+    def _edges(self, frame: Frame) -> denoise_edges.EdgeSettings:
+        edges = denoise_edges.EdgeSettings()
+        edges.samples = self.edge_samples if frame.has_camera_rays else 0
+        edges.seed, edges.tent = frame.seed, int(frame.settings.filter == "tent")
+        edges.weight, edges.clip = self.blend, CLIP
+        return edges
 
     @staticmethod
     def _signals(frame: Frame) -> denoise.Signals:
