@@ -1,16 +1,29 @@
-"""Denoising after light_field_probes.txt, section 5.1: two kinds of light, a temporal and a spatial filter for each.
+"""Denoising of two kinds of light: an average over frames, then an edge-avoiding filter that variance guides.
 
 Diffuse light is filtered as incident light (what leaves divided by the diffuse albedo) and glossy light
 as radiance divided by the specular colour, so that no texture is blurred.
+
+After Schied et al. 2017, "Spatiotemporal Variance-Guided Filtering", and Dammertz et al. 2010, "Edge-Avoiding A-Trous
+Wavelet Transform". Unlike the former nothing that is filtered over pixels is remembered: that darkens and smears. Where
+an average is short, differences of light are those of a wider mean, and not of the samples: dark samples are many and
+bright ones few, so that weights by the samples themselves lose light.
 """
 
 import warp as wp
+
+from warp_gi.kernels.bsdf import luminance
 
 wp.set_module_options({"enable_backward": False})
 
 LEAST_SPECULAR = wp.constant(wp.float32(1.0e-3))  # glossy light is divided by no less
 LEAST_REFLECTANCE = wp.constant(wp.float32(1.0e-6))  # where a surface is darker, no light to filter leaves it
-LEAST_COSINE = wp.constant(wp.float32(0.9))  # between normals of one surface in two frames
+LEAST_COSINE = wp.constant(wp.float32(0.85))  # between normals of one surface
+FOOTPRINTS = wp.constant(wp.float32(3.0))  # of a pixel, from a plane, within which a point is of the same surface
+BLOCK = wp.constant(8)  # pixels along a side of the blocks in which light is compared with what was
+LEAST_CHANGE = wp.constant(wp.float32(0.1))  # share of the light that is no change, however sure
+LONG = wp.constant(wp.float32(4.0))  # frames from which on an average knows its variance
+SMALLEST_DEVIATION = wp.constant(wp.float32(1.0e-6))  # W/m^2; below it luminances are equal
+LARGEST_EXPONENT = wp.constant(wp.float32(12.0))  # of a tap's weight: what is farther off counts nothing
 LEAST_WEIGHT = wp.constant(wp.float32(1.0e-2))  # of history: less is a neighbour's light, which a pixel hardly touches
 
 
@@ -41,12 +54,28 @@ class NoisyLight:
     lobe_glossy: wp.array(dtype=wp.vec3)
 
 
-# Light on its way through the filters, [height * width].
+# Light of a frame or an average over frames, [height * width].
 @wp.struct
 class Signals:
     diffuse: wp.array(dtype=wp.vec3)  # incident
     glossy: wp.array(dtype=wp.vec3)  # divided by the specular colour
-    length: wp.array(dtype=wp.float32)  # frames in the average
+    moments: wp.array(dtype=wp.vec2)  # means of the squared luminance of both
+    length: wp.array(dtype=wp.float32)  # frames in the average; 0: none
+
+
+# Light on its way through the filter over pixels, [height * width]: colour, and the variance of its luminance.
+@wp.struct
+class Filtered:
+    diffuse: wp.array(dtype=wp.vec4)
+    glossy: wp.array(dtype=wp.vec4)
+
+
+# How far a block's new samples are from the average before, [blocks]: 0 as expected, 1 another light.
+@wp.struct
+class Changes:
+    diffuse: wp.array(dtype=wp.float32)
+    glossy: wp.array(dtype=wp.float32)
+    columns: wp.int32  # of blocks
 
 
 # Weighted sums over pixels of the frame before.
@@ -56,29 +85,23 @@ class Gathered:
     length: wp.float32
     diffuse: wp.vec3
     glossy: wp.vec3
+    moments: wp.vec2
 
 
 @wp.struct
-class TemporalSettings:
+class DenoiseSettings:
     width: wp.int32
     height: wp.int32
-    diffuse_weight: wp.float32  # of a new frame in a long average: 1 - hysteresis
-    glossy_weight: wp.float32
-    plane_distance: wp.float32  # beyond it is another surface; a share of the distance to the camera
-
-
-@wp.struct
-class SpatialSettings:
-    width: wp.int32
-    height: wp.int32
-    radius: wp.int32  # pixels
-    stride: wp.int32  # pixels
-    deviation: wp.float32  # pixels, of the gaussian, for a single sample
-    plane_distance: wp.float32  # standard deviation, as a share of the distance to the camera
-    normal_power: wp.float32  # exponent of the cosine between normals
-    samples: wp.float32  # in a frame
-    longest: wp.float32  # frames of independent samples that a long average is worth
-    shrink: wp.float32  # the deviation falls with this power of the samples in the average
+    footprint: wp.float32  # width of a pixel at a distance of 1
+    diffuse_frames: wp.float32  # most frames in an average
+    glossy_frames: wp.float32
+    lag: wp.float32  # deviations from which on light is another; 0: it is never
+    step: wp.int32  # pixels between the taps of this level
+    normal: wp.float32  # exponents of the weights
+    plane: wp.float32
+    luminance: wp.float32
+    filters_diffuse: wp.int32  # in this level
+    filters_glossy: wp.int32
 
 
 # a / b where b is above nothing.
@@ -113,13 +136,16 @@ def separate_light(first: wp.int32, light: NoisyLight, guides: Guides, out: Sign
     shared = divided(rest, diffuse + specular, LEAST_REFLECTANCE)
     out.diffuse[i] = incident + shared
     out.glossy[i] = wp.cw_div(glossy + wp.cw_mul(specular, shared), glossy_scale(specular))
+    d = luminance(out.diffuse[i])
+    g = luminance(out.glossy[i])
+    out.moments[i] = wp.vec2(d * d, g * g)
     out.length[i] = 1.0
 
 
 # Whether pixel (x, y) of the frame before saw the surface that pixel i sees now.
 @wp.func
 def saw_surface(
-    settings: TemporalSettings, now: Guides, before: Guides, i: wp.int32, x: wp.int32, y: wp.int32
+    settings: DenoiseSettings, now: Guides, before: Guides, i: wp.int32, x: wp.int32, y: wp.int32
 ) -> wp.bool:
     if x < 0 or y < 0 or x >= settings.width or y >= settings.height:
         return False
@@ -129,14 +155,14 @@ def saw_surface(
     if wp.dot(now.guide_normal[i], before.guide_normal[j]) < LEAST_COSINE:
         return False
     away = wp.dot(now.guide_plane[i], before.guide_position[j] - now.guide_previous[i])
-    return wp.abs(away) < settings.plane_distance * now.guide_distance[i]
+    return wp.abs(away) < FOOTPRINTS * settings.footprint * now.guide_distance[i]
 
 
 # Mean of the average before, over the pixels within `reach` of (x, y) that saw the surface of pixel i, by a
 # tent; bilinear for a reach of 1.
 @wp.func
 def gather_history(
-    settings: TemporalSettings,
+    settings: DenoiseSettings,
     now: Guides,
     before: Guides,
     history: Signals,
@@ -151,31 +177,24 @@ def gather_history(
     for k in range(4 * reach * reach):
         px = x0 + k % (2 * reach)
         py = y0 + k / (2 * reach)
-        if saw_surface(settings, now, before, i, px, py):
+        across = 1.0 - wp.abs(x - wp.float32(px)) / wp.float32(reach)
+        down = 1.0 - wp.abs(y - wp.float32(py)) / wp.float32(reach)
+        w = wp.max(across, 0.0) * wp.max(down, 0.0)
+        if w > 0.0 and saw_surface(settings, now, before, i, px, py):
             j = py * settings.width + px
-            across = 1.0 - wp.abs(x - wp.float32(px)) / wp.float32(reach)
-            down = 1.0 - wp.abs(y - wp.float32(py)) / wp.float32(reach)
-            w = wp.max(across, 0.0) * wp.max(down, 0.0)
             r.weight += w
             r.length += w * history.length[j]
             r.diffuse += w * history.diffuse[j]
             r.glossy += w * history.glossy[j]
+            r.moments += w * history.moments[j]
     return r
 
 
-# Thread: a pixel. Moves the average of the frames before to where its surface is now, and adds the new frame;
-# until the average is long every frame weighs the same. If none of the four nearest pixels saw the surface,
-# one next to them may have: at an outline camera samples hit now the one surface and now the other.
+# Thread: a pixel. Moves the average of the frames before to where its surface is now. If none of the four nearest
+# pixels saw the surface, one next to them may have: at an outline camera samples hit now the one surface and now the
+# other.
 @wp.kernel
-def accumulate_frames(
-    first: wp.int32,
-    settings: TemporalSettings,
-    now: Guides,
-    before: Guides,
-    noisy: Signals,
-    history: Signals,
-    out: Signals,
-):
+def reproject(first: wp.int32, settings: DenoiseSettings, now: Guides, before: Guides, history: Signals, out: Signals):
     i = first + wp.tid()
     h = Gathered()
     if now.guide_object[i] > 0:
@@ -185,75 +204,259 @@ def accumulate_frames(
         h = gather_history(settings, now, before, history, i, x, y, 1)
         if h.weight < LEAST_WEIGHT:
             h = gather_history(settings, now, before, history, i, x, y, 2)
-    if h.weight < LEAST_WEIGHT:
+    out.length[i] = 0.0
+    if h.weight >= LEAST_WEIGHT:
+        out.diffuse[i] = h.diffuse / h.weight
+        out.glossy[i] = h.glossy / h.weight
+        out.moments[i] = h.moments / h.weight
+        out.length[i] = h.length / h.weight
+
+
+# By how much a block's light has changed, from sums over its pixels of: the new light less the average before, the
+# variance of that, and the larger of the two lights.
+@wp.func
+def change_of(difference: wp.float32, variance: wp.float32, light: wp.float32, lag: wp.float32) -> wp.float32:
+    off = wp.abs(difference)
+    if off <= LEAST_CHANGE * light or variance <= 0.0:
+        return 0.0
+    return wp.clamp(off / (wp.sqrt(variance) * lag) - 1.0, 0.0, 1.0)
+
+
+# Thread: a block of pixels. Compares their new light with the average before, pixel by pixel. One outlier is no change:
+# it counts as much for the variance.
+@wp.kernel
+def find_changes(first: wp.int32, settings: DenoiseSettings, noisy: Signals, history: Signals, changes: Changes):
+    b = first + wp.tid()
+    x0 = (b % changes.columns) * BLOCK
+    y0 = (b / changes.columns) * BLOCK
+    difference = wp.vec2(0.0, 0.0)
+    variance = wp.vec2(0.0, 0.0)
+    light = wp.vec2(0.0, 0.0)
+    for y in range(y0, wp.min(y0 + BLOCK, settings.height)):
+        for x in range(x0, wp.min(x0 + BLOCK, settings.width)):
+            i = y * settings.width + x
+            length = history.length[i]
+            if length >= LONG:
+                new = wp.vec2(luminance(noisy.diffuse[i]), luminance(noisy.glossy[i]))
+                old = wp.vec2(luminance(history.diffuse[i]), luminance(history.glossy[i]))
+                off = new - old
+                spread = wp.max(history.moments[i] - wp.cw_mul(old, old), wp.vec2(0.0, 0.0))
+                difference += off
+                variance += wp.max(wp.cw_mul(off, off), spread) + spread / length
+                light += wp.max(new, old)
+    changes.diffuse[b] = change_of(difference[0], variance[0], light[0], settings.lag)
+    changes.glossy[b] = change_of(difference[1], variance[1], light[1], settings.lag)
+
+
+# Change at a pixel, between the middles of blocks.
+@wp.func
+def change_at(
+    values: wp.array(dtype=wp.float32), columns: wp.int32, rows: wp.int32, x: wp.int32, y: wp.int32
+) -> wp.float32:
+    u = wp.clamp((wp.float32(x) + 0.5) / wp.float32(BLOCK) - 0.5, 0.0, wp.float32(columns - 1))
+    v = wp.clamp((wp.float32(y) + 0.5) / wp.float32(BLOCK) - 0.5, 0.0, wp.float32(rows - 1))
+    i = wp.min(wp.int32(u), wp.max(columns - 2, 0))
+    j = wp.min(wp.int32(v), wp.max(rows - 2, 0))
+    i1 = wp.min(i + 1, columns - 1)
+    j1 = wp.min(j + 1, rows - 1)
+    fu = u - wp.float32(i)
+    fv = v - wp.float32(j)
+    top = values[j * columns + i] * (1.0 - fu) + values[j * columns + i1] * fu
+    bottom = values[j1 * columns + i] * (1.0 - fu) + values[j1 * columns + i1] * fu
+    return top * (1.0 - fv) + bottom * fv
+
+
+# Weight of a new frame where an average of so many frames is there: all weigh the same until there are `most`.
+@wp.func
+def new_weight(length: wp.float32, most: wp.float32, change: wp.float32) -> wp.float32:
+    kept = wp.min(length, most - 1.0) * (1.0 - change)
+    return 1.0 / (kept + 1.0)
+
+
+# Thread: a pixel. Adds the new frame to the average; `out` is it, and may be the average before.
+@wp.kernel
+def add_frame(
+    first: wp.int32, settings: DenoiseSettings, noisy: Signals, history: Signals, changes: Changes, out: Signals
+):
+    i = first + wp.tid()
+    length = history.length[i]
+    if length <= 0.0:
         out.diffuse[i] = noisy.diffuse[i]
         out.glossy[i] = noisy.glossy[i]
+        out.moments[i] = noisy.moments[i]
         out.length[i] = 1.0
-    else:
-        length = h.length / h.weight + 1.0
-        a = wp.max(settings.diffuse_weight, 1.0 / length)
-        b = wp.max(settings.glossy_weight, 1.0 / length)
-        out.diffuse[i] = h.diffuse / h.weight * (1.0 - a) + noisy.diffuse[i] * a
-        out.glossy[i] = h.glossy / h.weight * (1.0 - b) + noisy.glossy[i] * b
-        out.length[i] = length
+        return
+    change = wp.vec2(0.0, 0.0)
+    if settings.lag > 0.0:
+        y = i / settings.width
+        x = i - y * settings.width
+        rows = changes.diffuse.shape[0] / changes.columns
+        change[0] = change_at(changes.diffuse, changes.columns, rows, x, y)
+        change[1] = change_at(changes.glossy, changes.columns, rows, x, y)
+    a = new_weight(length, settings.diffuse_frames, change[0])
+    b = new_weight(length, settings.glossy_frames, change[1])
+    out.diffuse[i] = history.diffuse[i] * (1.0 - a) + noisy.diffuse[i] * a
+    out.glossy[i] = history.glossy[i] * (1.0 - b) + noisy.glossy[i] * b
+    m = history.moments[i]
+    n = noisy.moments[i]
+    out.moments[i] = wp.vec2(m[0] * (1.0 - a) + n[0] * a, m[1] * (1.0 - b) + n[1] * b)
+    out.length[i] = wp.min(length * (1.0 - change[0]) + 1.0, settings.diffuse_frames)
 
 
-# Thread: a pixel. The cross-bilateral mean of its neighbourhood: gaussian in pixels and in the distance to
-# its tangent plane, and a power of the cosine between normals.
+# Whether pixel j sees the surface of pixel i.
+@wp.func
+def same_surface(settings: DenoiseSettings, guides: Guides, i: wp.int32, j: wp.int32) -> wp.bool:
+    if guides.guide_object[j] != guides.guide_object[i]:
+        return False
+    if wp.dot(guides.guide_normal[i], guides.guide_normal[j]) < LEAST_COSINE:
+        return False
+    away = wp.dot(guides.guide_plane[i], guides.guide_position[j] - guides.guide_position[i])
+    return wp.abs(away) < FOOTPRINTS * settings.footprint * guides.guide_distance[i]
+
+
+# Thread: a pixel. Writes the light with the variance of its mean, and the luminances by which the first level tells
+# lights apart: of a long average its own; of a short one the mean of the pixels around, whose differences are its
+# variance, too.
 @wp.kernel
-def filter_neighbourhood(
+def estimate_variance(
     first: wp.int32,
-    settings: SpatialSettings,
+    settings: DenoiseSettings,
     guides: Guides,
-    source: wp.array(dtype=wp.vec3),
-    length: wp.array(dtype=wp.float32),
-    out: wp.array(dtype=wp.vec3),
+    average: Signals,
+    out: Filtered,
+    tells: wp.array(dtype=wp.vec2),
+):
+    i = first + wp.tid()
+    d = average.diffuse[i]
+    g = average.glossy[i]
+    mean = wp.vec2(luminance(d), luminance(g))
+    square = average.moments[i]
+    spread = wp.max(square - wp.cw_mul(mean, mean), wp.vec2(0.0, 0.0))
+    length = average.length[i]
+    if guides.guide_object[i] > 0:
+        y = i / settings.width
+        x = i - y * settings.width
+        reach = wp.where(length < LONG, 3, 1)
+        count = float(0.0)
+        sums = wp.vec2(0.0, 0.0)
+        squares = wp.vec2(0.0, 0.0)
+        spreads = wp.vec2(0.0, 0.0)
+        for ty in range(wp.max(y - reach, 0), wp.min(y + reach + 1, settings.height)):
+            for tx in range(wp.max(x - reach, 0), wp.min(x + reach + 1, settings.width)):
+                j = ty * settings.width + tx
+                if same_surface(settings, guides, i, j):
+                    l = wp.vec2(luminance(average.diffuse[j]), luminance(average.glossy[j]))
+                    count += 1.0
+                    sums += l
+                    squares += wp.cw_mul(l, l)
+                    spreads += wp.max(average.moments[j] - wp.cw_mul(l, l), wp.vec2(0.0, 0.0))
+        spread = spreads / count / wp.max(length - 1.0, 1.0)
+        if length < LONG:
+            mean = sums / count
+            spread = wp.max(squares / count - wp.cw_mul(mean, mean), wp.vec2(0.0, 0.0)) * (LONG / length)
+    out.diffuse[i] = wp.vec4(d[0], d[1], d[2], spread[0])
+    out.glossy[i] = wp.vec4(g[0], g[1], g[2], spread[1])
+    tells[i] = mean
+
+
+# Luminances that tell lights apart: those handed over, or where there are none the light's own.
+@wp.func
+def telling(tells: wp.array(dtype=wp.vec2), light: Filtered, i: wp.int32) -> wp.vec2:
+    if tells.shape[0] > 0:
+        return tells[i]
+    d = light.diffuse[i]
+    g = light.glossy[i]
+    return wp.vec2(luminance(wp.vec3(d[0], d[1], d[2])), luminance(wp.vec3(g[0], g[1], g[2])))
+
+
+# Mean variance of a pixel and of the taps around it that are of its object.
+@wp.func
+def variance_around(settings: DenoiseSettings, guides: Guides, light: Filtered, i: wp.int32) -> wp.vec2:
+    y = i / settings.width
+    x = i - y * settings.width
+    total = float(0.0)
+    sums = wp.vec2(0.0, 0.0)
+    for row in range(-1, 2):
+        for column in range(-1, 2):
+            ty = y + row
+            tx = x + column
+            j = ty * settings.width + tx
+            if ty >= 0 and ty < settings.height and tx >= 0 and tx < settings.width:
+                if guides.guide_object[j] == guides.guide_object[i]:
+                    w = 1.0 / wp.float32(1 + row * row) / wp.float32(1 + column * column)
+                    total += w
+                    sums += w * wp.vec2(light.diffuse[j][3], light.glossy[j][3])
+    return sums / total
+
+
+# Light times a weight; its variance by the square of it.
+@wp.func
+def tap(light: wp.vec4, weight: wp.float32) -> wp.vec4:
+    return wp.vec4(light[0] * weight, light[1] * weight, light[2] * weight, light[3] * weight * weight)
+
+
+# Thread: a pixel. One level of the filter over pixels: nine taps, `step` pixels apart, weighed by the distance to the
+# pixel's tangent plane, by normals, and by luminance over its deviation.
+@wp.kernel
+def filter_level(
+    first: wp.int32,
+    settings: DenoiseSettings,
+    guides: Guides,
+    light: Filtered,
+    tells: wp.array(dtype=wp.vec2),
+    out: Filtered,
 ):
     i = first + wp.tid()
     if guides.guide_object[i] == 0:
-        out[i] = source[i]
+        out.diffuse[i] = light.diffuse[i]
+        out.glossy[i] = light.glossy[i]
         return
     y = i / settings.width
     x = i - y * settings.width
-    samples = wp.min(length[i], settings.longest) * settings.samples
-    deviation = settings.deviation * wp.pow(samples, -settings.shrink)
-    steps = wp.min(settings.radius, wp.int32(3.0 * deviation)) / settings.stride
-    by_pixels = 0.5 / (deviation * deviation)
-    plane = settings.plane_distance * guides.guide_distance[i]
-    by_plane = 0.5 / (plane * plane)
-    position = guides.guide_position[i]
-    face = guides.guide_plane[i]
-    normal = guides.guide_normal[i]
-    total = float(0.0)
-    mean = wp.vec3(0.0, 0.0, 0.0)
-    for row in range(-steps, steps + 1):
-        ty = y + row * settings.stride
-        if ty >= 0 and ty < settings.height:
-            for column in range(-steps, steps + 1):
-                tx = x + column * settings.stride
-                j = ty * settings.width + tx
-                if tx >= 0 and tx < settings.width and guides.guide_object[j] > 0:
-                    squared = wp.float32((row * row + column * column) * settings.stride * settings.stride)
-                    away = wp.dot(face, guides.guide_position[j] - position)
-                    turned = 1.0 - wp.dot(normal, guides.guide_normal[j])
-                    e = squared * by_pixels + away * away * by_plane + turned * settings.normal_power
-                    if row == 0 and column == 0:
-                        e = float(0.0)  # the pixel itself, whatever rounding makes of its normal
-                    if e < 12.0:
-                        w = wp.exp(-e)
-                        total += w
-                        mean += w * source[j]
-    out[i] = mean / total
+    variance = variance_around(settings, guides, light, i)
+    mine = telling(tells, light, i)
+    by_diffuse = 1.0 / (settings.luminance * wp.sqrt(variance[0]) + SMALLEST_DEVIATION)
+    by_glossy = 1.0 / (settings.luminance * wp.sqrt(variance[1]) + SMALLEST_DEVIATION)
+    by_plane = 1.0 / (settings.plane * settings.footprint * guides.guide_distance[i])
+    d = light.diffuse[i]
+    g = light.glossy[i]
+    d_total = float(1.0)
+    g_total = float(1.0)
+    for k in range(9):
+        row = k / 3 - 1
+        column = k % 3 - 1
+        ty = y + row * settings.step
+        tx = x + column * settings.step
+        j = ty * settings.width + tx
+        if k != 4 and ty >= 0 and ty < settings.height and tx >= 0 and tx < settings.width:
+            if guides.guide_object[j] > 0:
+                away = wp.dot(guides.guide_plane[i], guides.guide_position[j] - guides.guide_position[i])
+                turned = 1.0 - wp.dot(guides.guide_normal[i], guides.guide_normal[j])
+                e = wp.abs(away) * by_plane + turned * settings.normal
+                if e < LARGEST_EXPONENT:
+                    other = telling(tells, light, j)
+                    w = 1.0 / wp.float32((1 + row * row) * (1 + column * column))
+                    if settings.filters_diffuse != 0:
+                        a = w * wp.exp(-e - wp.abs(other[0] - mine[0]) * by_diffuse)
+                        d = d + tap(light.diffuse[j], a)
+                        d_total += a
+                    if settings.filters_glossy != 0:
+                        b = w * wp.exp(-e - wp.abs(other[1] - mine[1]) * by_glossy)
+                        g = g + tap(light.glossy[j], b)
+                        g_total += b
+    out.diffuse[i] = tap(d, 1.0 / d_total)
+    out.glossy[i] = tap(g, 1.0 / g_total)
 
 
 # Thread: a pixel. Puts the filtered light back on its surface. What was not filtered stays as it was.
 @wp.kernel
-def put_back(first: wp.int32, light: NoisyLight, guides: Guides, filtered: Signals, beauty: wp.array(dtype=wp.vec3)):
+def put_back(first: wp.int32, light: NoisyLight, guides: Guides, filtered: Filtered, beauty: wp.array(dtype=wp.vec3)):
     i = first + wp.tid()
     if guides.guide_object[i] == 0:
         beauty[i] = light.noisy[i]
         return
-    diffuse = guides.guide_diffuse[i]
-    specular = guides.guide_specular[i]
-    both = wp.cw_mul(diffuse, filtered.diffuse[i]) + wp.cw_mul(glossy_scale(specular), filtered.glossy[i])
-    beauty[i] = light.emission[i] + both
+    d = filtered.diffuse[i]
+    g = filtered.glossy[i]
+    diffuse = wp.cw_mul(guides.guide_diffuse[i], wp.vec3(d[0], d[1], d[2]))
+    glossy = wp.cw_mul(glossy_scale(guides.guide_specular[i]), wp.vec3(g[0], g[1], g[2]))
+    beauty[i] = light.emission[i] + diffuse + glossy

@@ -272,14 +272,14 @@ def test_values_of_presets_name_classes_to_any_depth(monkeypatch):
     assert ends == gi.BsdfPaths(max_depth=4, ends_in=gi.LightFieldProbes(mode="irradiance"))
     preset = {
         "indirect": ("BsdfPaths", {"ends_in": "LightFieldProbes"}),
-        "denoise": ("SpatioTemporal", {"shrink": 0.0}),
+        "denoise": ("SpatioTemporal", {"lag": 0.0}),
     }
     known = registry.presets()
-    monkeypatch.setattr(registry, "presets", lambda: known | {"clean": {**preset, "filter": "tent"}})
-    clean = gi.Pipeline.preset("clean", spp=2)
+    monkeypatch.setattr(registry, "presets", lambda: known | {"tidy": {**preset, "filter": "tent"}})
+    clean = gi.Pipeline.preset("tidy", spp=2)
     assert clean.indirect.ends_in == gi.LightFieldProbes() and clean.filter == "tent" and clean.spp == 2
-    assert clean.denoise == gi.SpatioTemporal(shrink=0.0)
-    assert gi.Pipeline.preset("clean", denoise=None).denoise is None
+    assert clean.denoise == gi.SpatioTemporal(lag=0.0)
+    assert gi.Pipeline.preset("tidy", denoise=None).denoise is None
 
 
 @dataclass(frozen=True)

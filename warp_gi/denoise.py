@@ -5,14 +5,13 @@ from __future__ import annotations
 import importlib
 import math
 from dataclasses import dataclass
-from numbers import Integral
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import warp as wp
 
-from warp_gi.errors import OptionError, one_line, unknown_name
-from warp_gi.kernels import denoise
+from warp_gi.errors import OptionError, check_whole, one_line, unknown_name
+from warp_gi.kernels import denoise, denoise_edges
 from warp_gi.stateful import Ahead, Stateful
 
 if TYPE_CHECKING:
@@ -23,7 +22,9 @@ if TYPE_CHECKING:
 
 __all__ = ["DENOISERS", "Denoiser", "Oidn", "SpatioTemporal"]
 
-MOST_RADIUS = 64  # pixels
+MOST_LEVELS = 8
+CLIP = 1.5
+"""Standard deviations of the pixels around a pixel, to which the last picture is limited in it."""
 QUALITIES = ("high", "balanced", "fast")
 
 
@@ -60,11 +61,13 @@ class History:
     resolution: tuple[int, int]
     """Width and height of the frame in pixels."""
     scene: tuple[Scene | BakedScene, str]
-    """Scene and its hash: another sky or animation is another light."""
+    """Scene and the hash of what must not have changed: ``light_of``."""
     guides: denoise.Guides
     """Geometry and colours of the surfaces in the frame's pixels."""
     average: denoise.Signals
     """Averages over frames of diffuse and glossy light, and the number of frames in them."""
+    picture: wp.array
+    """The frame's beauty, vec3 [height * width]."""
 
     def leads_to(self, frame: Frame) -> bool:
         """Return whether the frame's motion is towards the last frame, of the same scene and size."""
@@ -72,116 +75,153 @@ class History:
             frame.previous_index == self.index != frame.index
             and frame.camera.resolution == self.resolution
             and frame.scene is self.scene[0]
-            and frame.scene.hash == self.scene[1]
+            and light_of(frame.scene) == self.scene[1]
         )
+
+
+def light_of(scene: Scene | BakedScene) -> str:
+    """Return a hash of a scene's light; of all but the sky where that changes over time, little by little."""
+    return scene.contents_hash if scene.is_sky_animated else scene.hash
 
 
 @dataclass(frozen=True)
 class SpatioTemporal(Denoiser):
-    """A filter over frames, then over neighbouring pixels; diffuse and glossy light apart.
+    """An average over frames, then an edge-avoiding filter over pixels that variance guides; diffuse and glossy apart.
 
     Diffuse light is filtered before it meets the albedo, glossy light before it meets the specular colour.
-    Light that estimators do not separate is shared out by reflectance. Blurs shadows and reflections, and
-    lags behind light that moves. Source: light_field_probes.txt, section 5.1.
+    Light that estimators do not separate is shared out by reflectance. Sources: Schied et al. 2017,
+    "Spatiotemporal Variance-Guided Filtering"; Dammertz et al. 2010, "Edge-Avoiding A-Trous Wavelet Transform".
+    What is filtered over pixels is not remembered, unlike in the former.
 
     The average over frames ends where the surface was not seen, and starts anew after a cut, a change of the
-    sky, or frames that do not follow one another. Raises OptionError for settings out of range.
+    sky, or frames that do not follow one another. Where a block of pixels has another light than before, earlier
+    frames are forgotten. Raises OptionError for settings out of range.
     """
 
     wants_lobes: ClassVar[bool] = True
 
-    diffuse_radius: int = 12
-    """Radius in pixels of the filter of diffuse light. 0 is no filter over pixels."""
-    diffuse_stride: int = 2
-    """Distance in pixels between the taps of the filter of diffuse light."""
-    diffuse_hysteresis: float = 0.98
-    """Weight of the frames before in the average of diffuse light. 0 is no average over frames."""
-    glossy_radius: int = 3
-    """Radius in pixels of the filter of glossy light. 0 is no filter over pixels."""
-    glossy_stride: int = 1
-    """Distance in pixels between the taps of the filter of glossy light."""
-    glossy_hysteresis: float = 0.75
-    """Weight of the frames before in the average of glossy light."""
-    plane_distance: float = 0.02
-    """Distance to a pixel's tangent plane that makes another surface, as a share of the distance to the camera."""
-    normal_power: float = 8.0
-    """Power of the cosine between two pixels' normals that is a factor of their weight."""
-    shrink: float = 1.0 / 3.0
-    """Power of the number of samples averaged over frames by which the filter over pixels narrows. 0 keeps it."""
+    frames: int = 32
+    """Most frames in the average of diffuse light, 1 to 1024. 1 is no average over frames."""
+    glossy_frames: int = 16
+    """Most frames in the average of glossy light, which moves over surfaces as the camera does."""
+    levels: int = 4
+    """Levels of the filter of diffuse light over pixels, 0 to 8: each reaches twice as far as the one before, and the
+    first to the next pixels. 0 is no filter. A frame without a frame before has one more."""
+    glossy_levels: int = 2
+    """The same of glossy light."""
+    luminance: float = 2.0
+    """Standard deviations between two pixels' luminances that make their weight 1/e."""
+    normal_power: float = 32.0
+    """Factor of 1 - the cosine between two pixels' normals in the exponent of their weight."""
+    plane_distance: float = 1.0
+    """Distance to a pixel's tangent plane that makes a weight 1/e, in widths of a pixel there."""
+    lag: float = 3.0
+    """Standard deviations by which the light of a block of 8x8 pixels has changed when earlier frames begin to be
+    forgotten; at twice as many all are. 0 never forgets."""
+
+    edge_samples: int = 4
+    """Camera samples of a pixel whose neighbours show something else, 0 to 64. They share the light of the pixels
+    around, and cost no light samples. 0 takes none."""
+    blend: float = 1.0
+    """Weight of a frame in the average of pictures, above 0 to 1 (temporal antialiasing): 0.25 flickers less and is
+    softer; 1 is no average."""
 
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
-        for kind in ("diffuse", "glossy"):
-            radius, stride = getattr(self, f"{kind}_radius"), getattr(self, f"{kind}_stride")
-            hysteresis = getattr(self, f"{kind}_hysteresis")
-            for name, value in (("radius", radius), ("stride", stride)):
-                if isinstance(value, bool) or not isinstance(value, Integral):
-                    raise OptionError(f"{kind}_{name} must be a whole number of pixels, got {value!r}")
-            if not 0 <= radius <= MOST_RADIUS:
-                raise OptionError(f"{kind}_radius must be from 0 to {MOST_RADIUS} pixels, got {radius}")
-            if stride < 1:
-                raise OptionError(f"{kind}_stride must be at least 1 pixel, got {stride}")
-            if not 0 <= hysteresis < 1:
-                raise OptionError(f"{kind}_hysteresis must be at least 0 and below 1, got {hysteresis}")
-        for name in ("plane_distance", "normal_power"):
+        check_whole("edge_samples", self.edge_samples, 0, 64)
+        if not 0 < self.blend <= 1:
+            raise OptionError(f"blend must be a weight above 0 and at most 1, got {self.blend}")
+        for name in ("frames", "glossy_frames"):
+            check_whole(name, getattr(self, name), 1, 1024)
+        for name in ("levels", "glossy_levels"):
+            check_whole(name, getattr(self, name), 0, MOST_LEVELS)
+        for name in ("luminance", "plane_distance", "normal_power"):
             if not 0 < getattr(self, name) < math.inf:
                 raise OptionError(f"{name} must be above 0, got {getattr(self, name)}")
-        if not 0 <= self.shrink <= 1:
-            raise OptionError(f"shrink must be from 0 to 1, got {self.shrink}")
+        if not 0 <= self.lag < math.inf:
+            raise OptionError(f"lag must be 0 or a number of deviations above it, got {self.lag}")
 
     def apply(self, frame: Frame, state: History | None) -> History:
         """Fill ``frame["beauty"]``; the state is the last frame's History."""
-        # Over frames first: what is remembered stays sharp, and the more frames there are the less blur is needed.
-        # With a constant blur the order makes little difference: relative MSE at 8 spp, moving camera, 0.0061 this way
-        # and 0.0066 the other in cornell_box, 0.208 and 0.210 in atrium. With a blur that shrinks 0.0028 and 0.128.
         light, guides = frame.struct(denoise.NoisyLight), frame.struct(denoise.Guides)
-        signals = self._signals(frame)
-        frame.launch(denoise.separate_light, [light, guides, signals])
-        if state is not None and state.leads_to(frame):
-            average = self._signals(frame)
-            settings = self._temporal_settings(frame)
-            inputs = [settings, guides, state.guides, signals, state.average, average]
-            frame.launch(denoise.accumulate_frames, inputs)
-        else:
-            average = signals
-        frame.launch(denoise.put_back, [light, guides, self._blurred(frame, guides, average), frame["beauty"]])
-        scene = (frame.scene, frame.scene.hash)
-        return History(frame.index, frame.camera.resolution, scene, guides, average)
+        settings, average = self._settings(frame), self._signals(frame)
+        frame.launch(denoise.separate_light, [light, guides, average])
+        has_history = state is not None and state.leads_to(frame)
+        if state is not None and has_history:
+            average = self._accumulated(frame, settings, state, guides, average)
+        filtered = self._filtered(frame, settings, guides, average, 0 if has_history else 1)
+        frame.launch(denoise.put_back, [light, guides, filtered, frame["beauty"]])
+        edges = self._edges(frame)
+        if edges.samples > 0:
+            inputs = [frame.data, frame.camera_data, settings, edges, guides, filtered, frame["beauty"]]
+            frame.launch_tiled(denoise_edges.sample_edges, inputs)
+        if state is not None and has_history and self.blend < 1:
+            picture = wp.clone(frame["beauty"])
+            inputs = [settings, edges, frame["depth"], frame["motion"], picture, state.picture, frame["beauty"]]
+            frame.launch(denoise_edges.average_pictures, inputs)
+        scene = (frame.scene, light_of(frame.scene))
+        return History(frame.index, frame.camera.resolution, scene, guides, average, frame["beauty"])
 
-    def _blurred(self, frame: Frame, guides: denoise.Guides, source: denoise.Signals) -> denoise.Signals:
-        """Return signals filtered over pixels."""
-        filtered = denoise.Signals()
-        filtered.length = source.length
-        for kind in ("diffuse", "glossy"):
-            light = getattr(source, kind)
-            if getattr(self, f"{kind}_radius") == 0:
-                setattr(filtered, kind, light)
-                continue
-            setattr(filtered, kind, wp.empty_like(light))
-            inputs = [self._spatial_settings(frame, kind), guides, light, source.length, getattr(filtered, kind)]
-            frame.launch(denoise.filter_neighbourhood, inputs)
-        return filtered
+    def _accumulated(
+        self,
+        frame: Frame,
+        settings: denoise.DenoiseSettings,
+        state: History,
+        guides: denoise.Guides,
+        noisy: denoise.Signals,
+    ) -> denoise.Signals:
+        """Return the average over frames with this one in it."""
+        average, changes = self._signals(frame), denoise.Changes()
+        frame.launch(denoise.reproject, [settings, guides, state.guides, state.average, average])
+        columns, rows = (math.ceil(size / int(denoise.BLOCK)) for size in frame.camera.resolution)
+        changes.columns = columns
+        changes.diffuse = wp.empty(columns * rows, dtype=wp.float32, device=frame.device)
+        changes.glossy = wp.empty_like(changes.diffuse)
+        if self.lag > 0:
+            frame.launch(denoise.find_changes, [settings, noisy, average, changes], columns * rows)
+        frame.launch(denoise.add_frame, [settings, noisy, average, changes, average])
+        return average
 
-    def _temporal_settings(self, frame: Frame) -> denoise.TemporalSettings:
-        settings = denoise.TemporalSettings()
+    def _filtered(
+        self,
+        frame: Frame,
+        settings: denoise.DenoiseSettings,
+        guides: denoise.Guides,
+        average: denoise.Signals,
+        more: int,
+    ) -> denoise.Filtered:
+        """Return the average filtered over pixels, by ``more`` levels than the settings say."""
+        count = len(average.length)
+        light, spare = denoise.Filtered(), denoise.Filtered()
+        for signals in (light, spare):
+            signals.diffuse = wp.empty(count, dtype=wp.vec4, device=frame.device)
+            signals.glossy = wp.empty_like(signals.diffuse)
+        tells = wp.empty(count, dtype=wp.vec2, device=frame.device)
+        frame.launch(denoise.estimate_variance, [settings, guides, average, light, tells])
+        levels = [levels + more if levels else 0 for levels in (self.levels, self.glossy_levels)]
+        for level in range(max(levels)):
+            settings.step = 1 << level
+            settings.filters_diffuse, settings.filters_glossy = (int(level < most) for most in levels)
+            frame.launch(denoise.filter_level, [settings, guides, light, tells, spare])
+            light, spare = spare, light
+            tells = wp.empty(0, dtype=wp.vec2, device=frame.device)
+        return light
+
+    def _settings(self, frame: Frame) -> denoise.DenoiseSettings:
+        settings = denoise.DenoiseSettings()
         settings.width, settings.height = frame.camera.resolution
-        settings.diffuse_weight = 1.0 - self.diffuse_hysteresis
-        settings.glossy_weight = 1.0 - self.glossy_hysteresis
-        settings.plane_distance = self.plane_distance
+        settings.footprint = 2.0 * math.tan(math.radians(frame.camera.hfov) / 2) / settings.width
+        settings.diffuse_frames, settings.glossy_frames = self.frames, self.glossy_frames
+        settings.lag, settings.luminance = self.lag, self.luminance
+        settings.normal, settings.plane = self.normal_power, self.plane_distance
         return settings
 
-    def _spatial_settings(self, frame: Frame, kind: str) -> denoise.SpatialSettings:
-        hysteresis = getattr(self, f"{kind}_hysteresis")
-        settings = denoise.SpatialSettings()
-        settings.width, settings.height = frame.camera.resolution
-        settings.radius = getattr(self, f"{kind}_radius")
-        settings.stride = getattr(self, f"{kind}_stride")
-        settings.deviation = settings.radius / 2
-        settings.plane_distance, settings.normal_power = self.plane_distance, self.normal_power
-        settings.samples = frame.settings.spp
-        settings.longest = (1.0 + hysteresis) / (1.0 - hysteresis)
-        settings.shrink = self.shrink
-        return settings
+    def _edges(self, frame: Frame) -> denoise_edges.EdgeSettings:
+        edges = denoise_edges.EdgeSettings()
+        edges.samples = self.edge_samples if frame.has_camera_rays else 0
+        edges.seed, edges.tent = frame.seed, int(frame.settings.filter == "tent")
+        edges.weight, edges.clip = self.blend, CLIP
+        return edges
 
     @staticmethod
     def _signals(frame: Frame) -> denoise.Signals:
@@ -189,6 +229,7 @@ class SpatioTemporal(Denoiser):
         signals = denoise.Signals()
         signals.diffuse = wp.empty(width * height, dtype=wp.vec3, device=frame.device)
         signals.glossy = wp.empty_like(signals.diffuse)
+        signals.moments = wp.empty(width * height, dtype=wp.vec2, device=frame.device)
         signals.length = wp.empty(width * height, dtype=wp.float32, device=frame.device)
         return signals
 

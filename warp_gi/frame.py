@@ -91,6 +91,8 @@ class Frame:
         """Values by name that decide the pixels, beside camera and time."""
         self.paths = PathRequest(data.emitters)
         """Requests of estimators to the path tracer."""
+        self.has_camera_rays = False
+        """Whether the primary traces camera rays through the scene, so that more of them see the same."""
         self.estimators: dict[str, object] = {}
         """Estimators of the pipeline by their terms; a class that serves several finds its others here."""
         self.sky_probability = sky_probability(scene)

@@ -20,6 +20,7 @@ from warp_gi.estimator import Estimator
 from warp_gi.frame import Frame
 from warp_gi.kernels import compose, types
 from warp_gi.pipeline import DENOISER, Pipeline
+from warp_gi.primary import CameraRays
 from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.camera import Camera, CameraPath, frame_time
@@ -232,6 +233,7 @@ class FrameScheduler:
         settings, seed = self.pipeline.frame_settings, _mix(self.seed, index)
         frame = Frame(self.scene, data, *cameras, settings, self.device, index, now, seed, previous_index)
         frame.estimators = dict(self.pipeline.estimators())
+        frame.has_camera_rays = isinstance(self.pipeline.primary()[1], CameraRays)
         compiled = launch.compile_seconds - compiled
         frame.timings |= {"bake": self._bake_seconds, "compile": compiled}
         frame.timings["scene"] = time.perf_counter() - started - compiled

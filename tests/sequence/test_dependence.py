@@ -61,6 +61,8 @@ def preset(name, **settings):
         pipeline = replace(pipeline, indirect=replace(PROBES, primary=pipeline.indirect.primary))
     if pipeline.indirect is not None and pipeline.indirect.radiance_cache is not None:
         ends_in = replace(pipeline.indirect.radiance_cache, paths=2000)
+        if isinstance(ends_in, gi.SurfaceCache):
+            ends_in = replace(ends_in, refresh=1000)
         pipeline = replace(pipeline, indirect=replace(pipeline.indirect, ends_in=ends_in))
     for term in ("environment", "indirect"):
         if isinstance(getattr(pipeline, term), gi.RadianceTransfer):
@@ -154,6 +156,8 @@ CASES = {
     "probes fixed": Case("", preset("probes", indirect=replace(PROBES, update=0)), moving=True),
     "cache": Case("", preset("cache")),
     "cache turning": Case("", preset("cache"), turning=True),
+    "cache moving": Case("saved", preset("cache"), moving=True),
+    "clean": Case("unsaved", preset("clean"), moving=True),
     "transfer": Case("", preset("transfer")),
     "transfer turning": Case("", preset("transfer"), turning=True),
     "transfer moving": Case("", replace(preset("transfer"), indirect=None), moving=True),

@@ -53,14 +53,14 @@ def pipeline_rows(
     """Return the rows of one scene and pipeline; pictures are of the fewest rays."""
     indirect = terms.get("indirect")
     bakes = [gi.bake(scene, indirect, device, camera_path=path)] if indirect is not None else []
-    many = gi.Pipeline(**terms, spp=spp, camera_samples=1)
+    many = gi.Pipeline(**terms, spp=spp, camera_samples=min(spp, 64))
     truth = gi.FrameScheduler(scene, path, many, device, seed=101, bakes=bakes).frame(FRAME).numpy("beauty")
     rows: list[Row] = []
     for rays in RAYS:
         row: Row = {"table": "denoise", "case": name, "pipeline": label, "rays a pixel": rays}
         pictures: dict[str, np.ndarray] = {}
         for denoiser, short in DENOISERS.items():
-            few = gi.Pipeline(**terms, spp=rays, camera_samples=1, denoise=denoiser_named(denoiser))
+            few = gi.Pipeline(**terms, spp=rays, denoise=denoiser_named(denoiser))
             try:
                 scheduler = gi.FrameScheduler(scene, path, few, device, seed=1, bakes=bakes)
             except OptionError as missing:

@@ -8,7 +8,10 @@ TECHNIQUE = Technique(
     caches={
         "SurfaceCache": Entry("cache", {"": Claim(unbiased=False, bound=0.03), "residual": Claim({"residual": 0.3})})
     },
-    presets={"cache": {"indirect": ("BsdfPaths", {"ends_in": "SurfaceCache"})}},
+    presets={
+        "cache": {"indirect": ("BsdfPaths", {"ends_in": "SurfaceCache"})},
+        "clean": {"indirect": ("BsdfPaths", {"ends_in": "SurfaceCache"}), "denoise": "SpatioTemporal", "spp": 1},
+    },
     samplers=("surface_cache.SURFACE_CACHE",),
     bake_tool="bake_tool",
     suite="cache",
