@@ -15,7 +15,7 @@ from warp_gi.bench.harness import path_views, places
 from warp_gi.bench.harness.gallery import Gallery
 from warp_gi.bench.publish.figures import headlines_text, region_text
 from warp_gi.bench.report import suite_plots
-from warp_gi.bench.suites.cache import fills, leaks, light, views
+from warp_gi.bench.suites.cache import fills, leaks, light, moving, views
 from warp_gi.bench.suites.cache.columns import COLUMNS
 from warp_gi.bench.suites.cache.regions import HEADLINES, REGIONS
 
@@ -35,7 +35,12 @@ def rows(pictures) -> list[dict]:
         patch.setattr(fills, "PATHS", (50_000, 150_000, 500_000))
         for module in (light, leaks):
             patch.setattr(module, "SIZE", SIZE)
+        crate = replace(moving.CASES[0], frames={moving.ALL_ALONG: (1, 2)}, reference_spp=64)
+        lamp = replace(moving.CASES[-1], reference_spp=16)
+        patch.setattr(moving, "CASES", (crate, lamp))
+        patch.setattr(moving, "SIZE", SIZE)
         found = light.light_rows(False, "cpu", pictures) + leaks.leak_rows(False, "cpu")
+        found += moving.moving_rows(False, "cpu")
     return found
 
 
@@ -70,6 +75,15 @@ def test_fills_and_leaks_are_told(rows):
     assert by_paths[0]["samples a cell"] < by_paths[-1]["samples a cell"]
     assert [row["cell m"] for row in named(rows, leaks.LEAKS)][1:] == [0.1, 0.25]
     assert all(row["dark / lit"] < 0.1 for row in named(rows, leaks.LEAKS))
+
+
+def test_motion_is_told(rows):
+    crate = named(rows, moving.MOVING, case="crate slides")
+    assert [row["renderer"] for row in crate] == [moving.PATHS, moving.CACHE]
+    assert 0.9 < crate[1]["mean / paths"] < 1.1 and crate[1]["RMSE / mean"] < crate[0]["RMSE / mean"]
+    lamp = [row for row in named(rows, moving.MOVING, renderer=moving.CACHE) if "lamp" in row["case"]]
+    assert [row["case"].split(": ")[1] for row in lamp] == ["before", "that frame", "1 later", "4 later"]
+    assert lamp[1]["mean / paths"] > 0.8 and all(row["refresh s"] > 0 for row in lamp)
 
 
 def test_documents_show_all_of_it(rows):

@@ -16,7 +16,7 @@ COLUMNS = columns(
     measured(TIME, "us", "lower", "us a sample"),
     ratios("faster, {}"),
     # fills
-    measured(TIME, "s", "lower", "fill cpu s"),
+    measured(TIME, "s", "lower", "fill cpu s", "refresh s"),
     measured(COUNT, "cells", None, "cells"),
     measured(COUNT, "samples", None, "samples a cell"),
     measured(MEMORY, "MB", "lower", "MB"),

@@ -9,6 +9,7 @@ from warp_gi.bench.suites.cache.columns import COLUMNS
 from warp_gi.bench.suites.cache.fills import BY_PATHS, FILL
 from warp_gi.bench.suites.cache.leaks import LEAKS
 from warp_gi.bench.suites.cache.light import ALL, CACHE, CORRECTED, FEW, LIGHT, PATHS, REFERENCE, RESIDUAL
+from warp_gi.bench.suites.cache.moving import MOVING
 from warp_gi.bench.suites.cache.views import SPP
 
 
@@ -97,6 +98,22 @@ _CACHE = Region(
             LEAKS,
         ),
         Grid("scene", "case", (*_by_paths(50_000), *_by_paths(150_000), *_by_paths(500_000)), BY_PATHS),
+        Text(
+            "Scenes that move, {spp} samples a pixel: frames all along, and those about the one in which a lamp goes "
+            "that gave four fifths of the light. Each frame adds samples to the cells, in {seconds} s of one thread.",
+            {"spp": Figure("spp", {"renderer": CACHE}), "seconds": Figure("refresh s", {"renderer": CACHE})},
+            MOVING,
+        ),
+        Grid(
+            "scene",
+            "case",
+            (
+                _column("mean", "mean / paths", CACHE, FEW, digits=3),
+                _column("RMSE, %: paths", "RMSE / mean", PATHS, FEW, scale=100.0),
+                _column("cache", "RMSE / mean", CACHE, FEW, scale=100.0),
+            ),
+            MOVING,
+        ),
     ),
 )
 
