@@ -17,7 +17,7 @@ from warp_gi.kernels import denoise, denoise_edges
 CPU = wp.get_device("cpu")
 W, H = 15, 11
 NO_BLUR = {"levels": 0, "glossy_levels": 0, "edge_samples": 0}
-NO_EDGES = SpatioTemporal(edge_samples=0)
+NO_EDGES = SpatioTemporal(edge_samples=0, first_samples=1)
 
 
 def filled(struct, **arrays):
@@ -385,6 +385,16 @@ def test_still_light_is_not_forgotten():
     assert np.median(length) == 24 and length.mean() > 23
 
 
+def test_a_frame_without_a_frame_before_takes_more_samples():
+    """The first one, and one after a cut, are those of a pipeline of four samples; others are as asked."""
+    only = {"camera_samples": 1, "indirect": None}
+    scheduler = gi.FrameScheduler(scene(), sideways(), gi.Pipeline(spp=1, denoise="spatiotemporal", **only))
+    spp = {1: gi.Pipeline(spp=1, **only), 4: gi.Pipeline(spp=4, **only)}
+    for index, count in ((0, 4), (1, 1), (5, 4)):
+        wanted = next(gi.render(scene(), sideways(), spp[count], [index])).numpy("beauty")
+        np.testing.assert_array_equal(scheduler.frame(index).numpy("noisy"), wanted)
+
+
 def test_threads_do_not_change_a_bit():
     frames = []
     for threads in (1, 2):
@@ -579,6 +589,7 @@ def test_oidn_that_is_not_installed(monkeypatch):
         (lambda: SpatioTemporal(luminance=0.0), "luminance must be above 0"),
         (lambda: SpatioTemporal(plane_distance=0.0), "plane_distance must be above 0"),
         (lambda: SpatioTemporal(normal_power=float("nan")), "normal_power"),
+        (lambda: SpatioTemporal(first_samples=0), "first_samples must be a whole number from 1"),
         (lambda: SpatioTemporal(edge_samples=65), "edge_samples must be a whole number from 0 to 64, got 65"),
         (lambda: SpatioTemporal(blend=0.0), "blend must be a weight above 0 and at most 1, got 0"),
         (lambda: SpatioTemporal(lag=-1.0), "lag must be 0 or a number of deviations above it, got -1"),

@@ -47,6 +47,10 @@ class Denoiser(Stateful):
         """Return the same for every scene: a denoiser learns of a change from the frames."""
         return "any scene"
 
+    def samples(self, frame: Frame, state: Any) -> int:
+        """Return the number of samples a pixel that a frame is to take, from the pipeline's own: ``frame.settings``."""
+        return frame.settings.spp
+
     def apply(self, frame: Frame, state: Any) -> Any:
         """Fill ``frame["beauty"]`` from ``frame["noisy"]`` and the other buffers, and return the new state."""
         raise NotImplementedError
@@ -119,6 +123,9 @@ class SpatioTemporal(Denoiser):
     """Standard deviations by which the light of a block of 8x8 pixels has changed when earlier frames begin to be
     forgotten; at twice as many all are. 0 never forgets."""
 
+    first_samples: int = 4
+    """Samples a pixel, at least, of a frame without a frame before, 1 to 65536: the first one, a still, or after a cut.
+    There is no average yet that would make up for few."""
     edge_samples: int = 4
     """Camera samples of a pixel whose neighbours show something else, 0 to 64. They share the light of the pixels
     around, and cost no light samples. 0 takes none."""
@@ -128,6 +135,7 @@ class SpatioTemporal(Denoiser):
 
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
+        check_whole("first_samples", self.first_samples, 1, 1 << 16)
         check_whole("edge_samples", self.edge_samples, 0, 64)
         if not 0 < self.blend <= 1:
             raise OptionError(f"blend must be a weight above 0 and at most 1, got {self.blend}")
@@ -140,6 +148,11 @@ class SpatioTemporal(Denoiser):
                 raise OptionError(f"{name} must be above 0, got {getattr(self, name)}")
         if not 0 <= self.lag < math.inf:
             raise OptionError(f"lag must be 0 or a number of deviations above it, got {self.lag}")
+
+    def samples(self, frame: Frame, state: History | None) -> int:
+        """Return ``first_samples`` at least for a frame that no frame leads to."""
+        has_history = state is not None and state.leads_to(frame)
+        return frame.settings.spp if has_history else max(frame.settings.spp, self.first_samples)
 
     def apply(self, frame: Frame, state: History | None) -> History:
         """Fill ``frame["beauty"]``; the state is the last frame's History."""

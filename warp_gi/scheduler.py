@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import wraps
 from numbers import Integral
 from pathlib import Path
@@ -198,7 +199,9 @@ class FrameScheduler:
         if previous_index is None:
             previous_index = max(index - 1, 0)
         frame = self._new_frame(index, previous_index)
-        states = dict(self._states)
+        states, denoiser = dict(self._states), self._parts.get(DENOISER)
+        if isinstance(denoiser, Denoiser):
+            frame.settings = replace(frame.settings, spp=denoiser.samples(frame, states[DENOISER]))
         for place, part in self._parts.items():
             with frame.stage(f"preprocess {place}"):
                 states[place] = part.preprocess(frame, states[place])
@@ -212,7 +215,6 @@ class FrameScheduler:
             if part.learns:
                 with frame.stage(f"learn {place}"):
                     states[place] = part.after(frame, states[place])
-        denoiser = self._parts.get(DENOISER)
         if isinstance(denoiser, Denoiser):
             with frame.stage("denoise"):
                 frame.keep_noisy()
