@@ -77,7 +77,7 @@ def main(arguments: Sequence[str]) -> None:
     launch.on_load = loaded.append
     if name == FRAME:
         box = PLACES["cornell_box"]
-        next(iter(gi.render(box.scene(), box.camera().at_resolution(8, 8), device=device)))
+        next(iter(gi.render(box.scene(), box.camera().at_resolution(8, 8), gi.Pipeline(), device=device)))
     else:
         kernel_modules()  # a Warp module is known once its file is imported
         launch.load(next(iter(wp.get_module(name).kernels.values())), launch.get_device(device))
