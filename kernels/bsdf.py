@@ -152,6 +152,21 @@ def bsdf_evaluate(b: Bsdf, wo: wp.vec3, wi: wp.vec3) -> BsdfValue:
     return r
 
 
+# Share of what bsdf_evaluate gives that the diffuse lobe reflects, by colour.
+@wp.func
+def diffuse_part(b: Bsdf, wo: wp.vec3, wi: wp.vec3) -> wp.vec3:
+    if b.f90 <= 0.0:
+        return wp.vec3(1.0, 1.0, 1.0)
+    whole = bsdf_evaluate(b, wo, wi).value
+    f = fresnel(b, wp.dot(wo, wp.normalize(wo + wi)))
+    diffuse = wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - f, b.diffuse) * (wi[2] / wp.pi)
+    part = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(3):
+        if whole[k] > 0.0:
+            part[k] = wp.clamp(diffuse[k] / whole[k], 0.0, 1.0)
+    return part
+
+
 # Visible normal of GGX seen from wo.
 @wp.func
 def ggx_visible_normal(alpha: wp.float32, wo: wp.vec3, u: wp.vec2) -> wp.vec3:

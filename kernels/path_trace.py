@@ -18,8 +18,9 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from warp_gi.kernels.bsdf import luminance
+from warp_gi.kernels.bsdf import diffuse_part, luminance
 from warp_gi.kernels.bvh import BvhHit, bvh_intersect, bvh_occluded
+from warp_gi.kernels.denoise import LEAST_REFLECTANCE, divided
 from warp_gi.kernels.emitters import may_hit_emitter, triangle_light_pdf
 from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, tiled_pixel
 from warp_gi.kernels.light_connections import (
@@ -92,15 +93,19 @@ class PathSettings:
     sky_probability: wp.float32  # of sampling the sky, not an emitter, where a vertex samples one of the two
     clamp: wp.float32  # largest component of a path's indirect radiance; 0: no limit
     spp: wp.int32  # paths of a pixel in all of the frame
+    lobes: wp.int32  # 1: light is parted by the lobe of the first vertex that reflects it
     cache_vertex: wp.int32  # from which on paths may end in a radiance cache: 1 is the first hit; unused without one
 
 
-# Radiance of one path, by term.
+# Radiance of one path, by term; and by the lobe of the first vertex that reflects it, if asked for, but for what a
+# radiance cache knows there.
 @wp.struct
 class PathRadiance:
     environment: wp.vec3
     emitters: wp.vec3
     indirect: wp.vec3
+    diffuse: wp.vec3
+    glossy: wp.vec3
 
 
 # Sums over samples, [height * width].
@@ -109,6 +114,8 @@ class PathBuffers:
     environment: wp.array(dtype=wp.vec3)
     emitters: wp.array(dtype=wp.vec3)
     indirect: wp.array(dtype=wp.vec3)
+    lobe_diffuse: wp.array(dtype=wp.vec3)  # as Frame.lobes, or empty
+    lobe_glossy: wp.array(dtype=wp.vec3)
     moment1: wp.array(dtype=wp.vec3)  # of the samples of beauty
     moment2: wp.array(dtype=wp.vec3)  # of their squares
 
@@ -190,6 +197,9 @@ def _made(
         samples_sky = sky.is_sampled(samplers.sky, scene)
         sharpness = float(wp.inf)
         corrects = bool(False)
+        # light before the way on from the first vertex, and the diffuse lobe's share of what comes from there
+        before = wp.vec3(0.0, 0.0, 0.0)
+        diffuse_share = wp.vec3(0.0, 0.0, 0.0)
         for depth in range(2, paths.max_depth + 1):
             at_first = depth == 2
             d = PATH_DIMENSION + (depth - 2) * VERTEX_DIMENSIONS
@@ -300,6 +310,10 @@ def _made(
                             sky.leave(samplers.sky, path, depth, way.direction, wp.cw_mul(throughput, scattered))
                         if at_first:
                             r.environment = light
+                            if paths.lobes != 0:
+                                part = diffuse_part(s.bsdf, wo, wp.transpose(s.shading) * way.direction)
+                                r.diffuse = r.diffuse + wp.cw_mul(part, light)
+                                r.glossy = r.glossy + light - wp.cw_mul(part, light)
                         else:
                             r.indirect = r.indirect + wp.cw_mul(throughput, light)
             if wants_emitter:
@@ -320,11 +334,19 @@ def _made(
                                 light = sample.reflected * (choice.weight / (sample.pdf * emitter_share + pdf))
                         if at_first:
                             r.emitters = r.emitters + light
+                            if paths.lobes != 0:
+                                part = diffuse_part(s.bsdf, wo, wp.transpose(s.shading) * sample.direction)
+                                r.diffuse = r.diffuse + wp.cw_mul(part, light)
+                                r.glossy = r.glossy + light - wp.cw_mul(part, light)
                         else:
                             light = wp.cw_mul(throughput, light)
                             r.indirect = r.indirect + light
                         if at >= 0:
                             regions.light(samplers.regions, at, choice, sample.arrives, luminance(light))
+            if at_first and paths.lobes != 0:
+                before = r.environment + r.emitters + r.indirect
+                if goes_on:
+                    diffuse_share = diffuse_part(s.bsdf, wo, wp.transpose(s.shading) * wi)
             if not goes_on:
                 vertices += 1
                 break
@@ -381,6 +403,11 @@ def _made(
             s = surface_shape(scene, hit.face, hit.u, hit.v, view)
         if slot >= 0:
             regions.end(samplers.regions, slot, vertices, luminance(r.environment + r.indirect))
+        if paths.lobes != 0:
+            after = r.environment + r.emitters + r.indirect - before
+            by_diffuse = wp.cw_mul(diffuse_share, after)
+            r.diffuse = r.diffuse + by_diffuse
+            r.glossy = r.glossy + after - by_diffuse
         return r
 
     # Thread: a pixel. Adds `sample_count` paths from its current camera sample.
@@ -423,6 +450,8 @@ def _made(
         indirect = wp.vec3(0.0, 0.0, 0.0)
         moment1 = wp.vec3(0.0, 0.0, 0.0)
         moment2 = wp.vec3(0.0, 0.0, 0.0)
+        diffuse = wp.vec3(0.0, 0.0, 0.0)
+        glossy = wp.vec3(0.0, 0.0, 0.0)
         first_index = pixel_sample_index(p[0], p[1], settings.first_sample, settings.sample_bits)
         for i in range(settings.sample_count):
             path = wp.int64(first + wp.tid()) * wp.int64(paths.spp) + wp.int64(settings.first_sample + i)
@@ -433,6 +462,8 @@ def _made(
             environment = environment + r.environment
             emitters = emitters + r.emitters
             indirect = indirect + r.indirect
+            diffuse = diffuse + r.diffuse
+            glossy = glossy + r.glossy
             beauty = emission + r.environment + r.emitters + r.indirect
             moment1 = moment1 + beauty
             moment2 = moment2 + wp.cw_mul(beauty, beauty)
@@ -441,6 +472,10 @@ def _made(
         buffers.indirect[pixel] = buffers.indirect[pixel] + indirect
         buffers.moment1[pixel] = buffers.moment1[pixel] + moment1
         buffers.moment2[pixel] = buffers.moment2[pixel] + moment2
+        if paths.lobes != 0:
+            incident = divided(diffuse, s.bsdf.diffuse, LEAST_REFLECTANCE)
+            buffers.lobe_diffuse[pixel] = buffers.lobe_diffuse[pixel] + incident
+            buffers.lobe_glossy[pixel] = buffers.lobe_glossy[pixel] + glossy
 
     return PathTracer(Samplers, trace_path, trace_paths)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import warp as wp
-from scene_tools import card
+from scene_tools import card, quad
 
 import warp_gi as gi
 from warp_gi import launch
@@ -505,6 +505,44 @@ class Apart(gi.BsdfPaths):
         incident.assign(incident.numpy() + comes)
         glossy.assign(glossy.numpy() + leaves)
         frame["indirect"].assign(frame["indirect"].numpy() + guides.guide_diffuse.numpy() * comes + leaves)
+
+
+@pytest.mark.parametrize("roughness", [0.3, 0.7])
+def test_paths_part_light_by_lobes(roughness):
+    """Under a sky of radiance 1 and a map of it, which is sampled: integrals of both lobes in float64."""
+    red, f0, alpha = 0.6, 0.04, roughness**2
+    coated = gi.Material("coated", (red, 0.3, 0.1), roughness=roughness, specular=1.0)
+    shot = gi.Scene([gi.Node("floor", [quad((-50, 0, 50), (100, 0, 0), (0, 0, -100), coated, "floor")])])
+    camera = gi.Camera.look_at((0, 1.0, 1.0), (0, 0, 0), hfov=0.5, resolution=(32, 32))
+    c, p = np.stack(np.meshgrid((np.arange(400) + 0.5) / 400, (np.arange(400) + 0.5) / 400 * 2 * np.pi)).reshape(2, -1)
+    wi = np.stack([np.sqrt(1 - c**2) * np.cos(p), np.sqrt(1 - c**2) * np.sin(p), c], -1)
+    wo = np.array([np.sqrt(0.5), 0, np.sqrt(0.5)])
+    half = (wi + wo) / np.linalg.norm(wi + wo, axis=-1, keepdims=True)
+    fresnel = f0 + (1 - f0) * (1 - half @ wo) ** 5
+    d = alpha**2 / (np.pi * (half[:, 2] ** 2 * (alpha**2 - 1) + 1) ** 2)
+    root = lambda z: np.sqrt(alpha**2 + (1 - alpha**2) * z**2)  # noqa: E731
+    v = 0.5 / (wo[2] * root(c) + c * root(wo[2]))
+    diffuse, glossy = 2 * np.mean((1 - fresnel) * c), 2 * np.pi * np.mean(fresnel * d * v * c)
+    for sky in ((1.0, 1.0, 1.0), gi.Environment(pixels=np.ones((8, 16, 3), np.float32))):
+        shot.environment = sky
+        frame = next(gi.render(shot, camera, gi.Pipeline(spp=64, indirect=None, denoise=NO_EDGES)))
+        incident, reflected = (lobe.numpy().mean(axis=0) for lobe in frame.lobes())
+        np.testing.assert_allclose(incident, diffuse, rtol=0.005)
+        np.testing.assert_allclose(reflected, glossy, rtol=0.01)
+        sums = np.array([red, 0.3, 0.1]) * incident + reflected
+        np.testing.assert_allclose(sums, frame.numpy("environment").mean(axis=(0, 1)), rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["cornell_box", "sphere_row"])
+def test_lobes_of_paths_are_all_of_their_light(name):
+    """At pixel centres, where a pixel has one albedo; with lamps, sky, mirrors and indirect light."""
+    camera = gi.builtin_camera_path(name).camera(0).at_resolution(40, 24)
+    frame = next(gi.render(gi.builtin_scene(name), camera, gi.Pipeline(spp=4, camera_samples=1, denoise=NO_EDGES)))
+    incident, reflected = (lobe.numpy().reshape(24, 40, 3) for lobe in frame.lobes())
+    albedo = frame.struct(denoise.Guides).guide_diffuse.numpy().reshape(24, 40, 3)
+    light = sum(frame.numpy(term) for term in ("environment", "emitters", "indirect"))
+    np.testing.assert_allclose(albedo * incident + reflected, light, rtol=1e-3, atol=1e-4)
+    assert (incident > 0).any() and ((reflected > 0).any() or name == "cornell_box")
 
 
 def test_lobes_that_an_estimator_hands_over():

@@ -161,11 +161,11 @@ class Frame:
         return self._arrays[f"{name}_moment1"], self._arrays[f"{name}_moment2"]
 
     def lobes(self) -> tuple[wp.array, wp.array] | None:
-        """Return sums over samples that an estimator of indirect light may add to, or None: then nobody reads them.
+        """Return sums over samples that estimators may add to, as paths do, or None: then nobody reads them.
 
         Both are vec3 [height * width]. The first is diffuse light as it comes in: times the diffuse albedo it is
         the radiance that the diffuse lobe reflects. The second is the radiance that the glossy lobe reflects. What
-        is added here is part of the term's own buffer too; the denoiser takes it out of there.
+        is added here is part of the terms' own buffers too; the denoiser takes it out of there.
         """
         if not self.settings.wants_lobes:
             return None
@@ -234,7 +234,7 @@ class Frame:
         settings.terms, settings.max_depth = request.terms, request.max_depth
         settings.roulette_depth, settings.clamp = request.roulette_depth, request.clamp
         settings.sky_probability, settings.spp = self.sky_probability, self.settings.spp
-        settings.cache_vertex = request.cache_vertex
+        settings.cache_vertex, settings.lobes = request.cache_vertex, int(self.lobes() is not None)
         tracer = path_trace.path_tracer(*request.samplers())
         samplers = tracer.samplers()
         for name in tracer.samplers.vars:
