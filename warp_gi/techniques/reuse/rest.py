@@ -1,0 +1,166 @@
+"""Resting: a technique that gains less than it costs leaves paths to the plain samplers, and tries again later.
+
+All is decided by what samples tell and by constants, never by a clock, so that frames are the same on any machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from warp_gi import launch
+from warp_gi.kernels import reuse_gains, samples
+from warp_gi.techniques.reuse.sample_octree import Lesson, Motion
+
+if TYPE_CHECKING:
+    from warp_gi.frame import Frame
+
+CACHE_COST = 2.0
+"""Time of a frame with the light cache over one with the hierarchy. Measured in the warehouse by
+``warp-gi bench reuse --parts cost``."""
+GUIDE_COST = 1.35
+"""Time of a frame with guided paths over one with directions by the BSDF, measured likewise."""
+FIRST_TRIAL, LONGEST_FIRST_TRIAL, LONGEST_TRIAL = 6, 12, 3
+"""Frames of the first trial; of the same if its gain may still suffice, as quadtrees learn for ten frames; and of a
+later one, which goes on from what is known and else takes one."""
+PROMISING = 0.6
+"""Share of the gain that is needed from which on a trial goes on."""
+KEPT = 0.7
+"""Share of the gain that is needed below which a technique in use rests."""
+FIRST_REST, LONGEST_REST, LONGEST_REST_MOVING = 8, 128, 32
+"""Frames of the first rest, which double with each, and of the longest, where nothing moves and where things do."""
+WAKING = 24
+"""Frames of rest that allow for one frame of a trial ahead of time, when lights begin to move."""
+MOST_CREDIT = 6 * WAKING
+"""Frames of rest that are remembered for that."""
+TRIAL_FADING, USE_FADING = 0.5, 0.9
+"""Share of sums that stays from frame to frame, in a trial, in which gains grow, and in use."""
+MOST_GAIN = 4.0
+"""Largest gain that one frame tells of, in either direction, over the variance of its picture."""
+
+
+@dataclass(frozen=True)
+class Gains:
+    """By how much sample reuse lowers the variance of a frame's picture, in squared luminance of one path, W^2/(m^2
+    sr)^2, summed over pixels."""
+
+    variance: float
+    """What there is: half the mean squared difference of neighbouring pixels, edges within a surface included."""
+    lights: float
+    """By how much it would be more without the light cache."""
+    directions: float
+    """By how much it would be more without guided paths."""
+
+
+def frame_gains(frame: Frame, lesson: Lesson) -> Gains:
+    """Return the gains of a frame; worked out once for all who ask."""
+    known = frame.offered(Gains)
+    if known is not None:
+        return known
+    (width, height), records = frame.camera.resolution, lesson.records
+    rows = wp.empty(height, dtype=wp.vec3, device=frame.device)
+    inputs = [width, frame.struct(reuse_gains.VaryingTerms), rows]
+    launch.launch(reuse_gains.sum_differences, height, inputs, frame.device, 16)
+    squares, pairs, pixels = rows.numpy().sum(axis=0, dtype=np.float64)
+    chunks = -(-records.codes.shape[0] // samples.CHUNK)
+    sums = wp.empty(chunks, dtype=wp.vec2, device=frame.device)
+    launch.launch(reuse_gains.sum_gains, chunks, [records, sums], frame.device, 16)
+    spp = frame.settings.spp
+    lights, directions = sums.numpy().sum(axis=0, dtype=np.float64) * (records.stride / spp)
+    found = Gains(spp * 0.5 * squares / max(pairs, 1.0) * pixels, lights, directions)
+    frame.offer(found)
+    return found
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Whether a technique is tried, in use or at rest. No call changes it; each returns a new one.
+
+    A technique that needs ``cost`` times the time is in use while variance * cost < variance + gain.
+    """
+
+    left: int = 0
+    """Frames of this rest that are left; 0: it is awake."""
+    tried: int = 0
+    """Frames of this trial so far; -1: it is in use."""
+    longest: int = 0
+    """Frames of the last rest; 0 before the first one."""
+    credit: int = 0
+    """Frames of rest that allow for trials ahead of time."""
+    gain: float = 0.0
+    """Gains of the frames of this trial or use, summed with fading."""
+    variance: float = 0.0
+    """The same of their variances."""
+
+    @property
+    def is_resting(self) -> bool:
+        """Whether frames use the plain samplers."""
+        return self.left > 0
+
+    @property
+    def is_used(self) -> bool:
+        """Whether it has shown that it gains."""
+        return self.tried < 0
+
+    def woken(self) -> Rest:
+        """Return a trial in place of a rest, as lights began to move; the same where there were too many trials."""
+        if not self.is_resting or self.credit < WAKING:
+            return self
+        return Rest(credit=self.credit - WAKING, longest=FIRST_REST // 2)
+
+    def rested(self) -> Rest:
+        """Return the rest after one more frame."""
+        credit = min(self.credit + 1, MOST_CREDIT)
+        return replace(self, left=self.left - 1, credit=credit)
+
+    def judged(self, gain: float, variance: float, cost: float, moves: bool) -> Rest:
+        """Return what follows a frame that used the technique.
+
+        Args:
+            gain: By how much the variance would be more without it.
+            variance: That of the picture with it.
+            cost: Time of a frame with it over that of one without.
+            moves: Whether anything in the scene moves.
+        """
+        limit = MOST_GAIN * variance
+        fading = USE_FADING if self.is_used else TRIAL_FADING
+        known = replace(
+            self,
+            tried=self.tried if self.is_used else self.tried + 1,
+            gain=self.gain * fading + min(max(gain, -limit), limit),
+            variance=self.variance * fading + variance,
+        )
+        needed = (cost - 1.0) * known.variance
+        share = known.gain / needed if needed > 0.0 else 0.0
+        if self.is_used:
+            return known if share >= KEPT else self._resting(moves)
+        least, most = (FIRST_TRIAL, LONGEST_FIRST_TRIAL) if self.longest == 0 else (1, LONGEST_TRIAL)
+        if known.tried < least:
+            return known
+        if share >= 1.0:
+            return replace(known, tried=-1, longest=FIRST_REST // 2)
+        return known if share >= PROMISING and known.tried < most else self._resting(moves)
+
+    def _resting(self, moves: bool) -> Rest:
+        longest = LONGEST_REST_MOVING if moves else LONGEST_REST
+        frames = min(max(2 * self.longest, FIRST_REST), longest)
+        return Rest(left=frames, longest=frames, credit=self.credit)
+
+    def saved_arrays(self) -> dict[str, np.ndarray]:
+        """Return all numbers, float64, for a saved state."""
+        return {"numbers": np.array([getattr(self, one.name) for one in fields(self)], np.float64)}
+
+    def with_saved_arrays(self, arrays: Mapping[str, np.ndarray]) -> Rest:
+        """Return the rest of a saved state."""
+        kinds = (type(getattr(self, one.name)) for one in fields(self))
+        return Rest(*(kind(value) for kind, value in zip(kinds, arrays["numbers"], strict=True)))
+
+
+def woken_by(frame: Frame, rest: Rest) -> Rest:
+    """Return the rest for a frame, which ends if lights begin to move in it."""
+    motion = frame.offered(Motion)
+    return rest.woken() if motion is not None and motion.begins else rest
