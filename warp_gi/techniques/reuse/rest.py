@@ -37,10 +37,11 @@ WAKING = 24
 """Frames of rest that allow for one frame of a trial ahead of time, when lights begin to move."""
 MOST_CREDIT = 6 * WAKING
 """Frames of rest that are remembered for that."""
-TRIAL_FADING, USE_FADING = 0.5, 0.9
-"""Share of sums that stays from frame to frame, in a trial, in which gains grow, and in use."""
-MOST_GAIN = 4.0
-"""Largest gain that one frame tells of, in either direction, over the variance of its picture."""
+LEARNING_FADING, FADING = 0.5, 0.95
+"""Share of sums that stays from frame to frame: in the first trial, in which gains grow, and later."""
+MOST_GAIN, MOST_LOSS = 2.0, 10.0
+"""Largest gain and loss that one frame tells of, over the variance of its picture: what samples say that the picture
+does not show would be a few bright pixels in a hundred frames."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ class Rest:
     credit: int = 0
     """Frames of rest that allow for trials ahead of time."""
     gain: float = 0.0
-    """Gains of the frames of this trial or use, summed with fading."""
+    """Gains of the frames that used the technique, summed with fading."""
     variance: float = 0.0
     """The same of their variances."""
 
@@ -110,7 +111,7 @@ class Rest:
         """Return a trial in place of a rest, as lights began to move; the same where there were too many trials."""
         if not self.is_resting or self.credit < WAKING:
             return self
-        return Rest(credit=self.credit - WAKING, longest=FIRST_REST // 2)
+        return Rest(credit=self.credit - WAKING, longest=FIRST_REST // 2)  # what gained before says little now
 
     def rested(self) -> Rest:
         """Return the rest after one more frame."""
@@ -126,29 +127,29 @@ class Rest:
             cost: Time of a frame with it over that of one without.
             moves: Whether anything in the scene moves.
         """
-        limit = MOST_GAIN * variance
-        fading = USE_FADING if self.is_used else TRIAL_FADING
+        is_first = self.longest == 0
+        fading = LEARNING_FADING if is_first else FADING
         known = replace(
             self,
             tried=self.tried if self.is_used else self.tried + 1,
-            gain=self.gain * fading + min(max(gain, -limit), limit),
+            gain=self.gain * fading + min(max(gain, -MOST_LOSS * variance), MOST_GAIN * variance),
             variance=self.variance * fading + variance,
         )
         needed = (cost - 1.0) * known.variance
         share = known.gain / needed if needed > 0.0 else 0.0
         if self.is_used:
-            return known if share >= KEPT else self._resting(moves)
-        least, most = (FIRST_TRIAL, LONGEST_FIRST_TRIAL) if self.longest == 0 else (1, LONGEST_TRIAL)
+            return known if share >= KEPT else known._resting(moves)
+        least, most = (FIRST_TRIAL, LONGEST_FIRST_TRIAL) if is_first else (1, LONGEST_TRIAL)
         if known.tried < least:
             return known
         if share >= 1.0:
             return replace(known, tried=-1, longest=FIRST_REST // 2)
-        return known if share >= PROMISING and known.tried < most else self._resting(moves)
+        return known if share >= PROMISING and known.tried < most else known._resting(moves)
 
     def _resting(self, moves: bool) -> Rest:
         longest = LONGEST_REST_MOVING if moves else LONGEST_REST
         frames = min(max(2 * self.longest, FIRST_REST), longest)
-        return Rest(left=frames, longest=frames, credit=self.credit)
+        return replace(self, left=frames, tried=0, longest=frames)
 
     def saved_arrays(self) -> dict[str, np.ndarray]:
         """Return all numbers, float64, for a saved state."""
