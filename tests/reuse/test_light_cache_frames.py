@@ -225,7 +225,7 @@ def test_kept_lights():
     items[rng.random((2, count)) < 0.3] = -1
     values = np.where(arrives > 0, rng.random((2, count)), 0.0)
     glossy = np.where(rng.random(count) < 0.3, GLOSSY, 0)
-    chances = np.float32(rng.uniform(0.1, 1, (2, count, 3)))  # pdf, weight, other
+    chances = np.float32(rng.uniform(0.1, 1, (2, count, 4)))  # pdf, weight, other, selected
     chances[0, :100, 2] = -1.0  # where exploring is alone: unknown
     alone = np.zeros((2, count), int)
     alone[0, :200] = 1
@@ -233,7 +233,7 @@ def test_kept_lights():
     regions = samples.SampleRegions()
     regions.records = records_of(glossy, np.full(count, -3.0))
     for k in range(2):
-        given = [array(items[k]), k, array(alone[k]), array(chances[k], wp.vec3)]
+        given = [array(items[k]), k, array(alone[k]), array(chances[k], wp.vec4)]
         given += [array(arrives[k]), array(values[k], wp.float32)]
         launch(keep_lights, count, [regions, *given], device())
     found, kept = regions.records, []
@@ -253,9 +253,11 @@ def test_kept_lights():
             rival = chances[0, slot, 2] / chances[0, slot, 0] if items[0, slot] >= 0 else 0.0
         else:
             light_of = np.where((items[:, slot] >= 0) & (arrives[:, slot] == 1), values[:, slot], 0.0)
-            pdf, weight, other = chances[:, slot].astype(float).T
-            # that would have brought pdf / (weight * other) as much, and found it as much more rarely
-            rival = light_of.sum() ** 2 - (light_of**2 * pdf / (weight * other)).sum()
+            pdf, weight, other, selected = chances[:, slot].astype(float).T
+            # the density of the direction sampler, which may find the light too, stays as it is
+            density, times = selected / pdf * other + (1 - selected), weight / pdf
+            alone_brings = light_of / weight / density
+            rival = light_of.sum() ** 2 - (alone_brings**2 * times * other).sum()
         assert np.isclose(rivals[slot], rival, rtol=1e-4, atol=1e-4), slot
     assert set(kept) == {0, VISIBLE, BLOCKED, VISIBLE | EXPLORED, ALONE, VISIBLE | ALONE, BLOCKED | ALONE}
 

@@ -216,8 +216,8 @@ def learnt_excess(frame, data, spots, brings, count, rng):
         items, pdfs, weights, _, alone, others = choices(frame, data, spots, numbers, explores)
         there = items >= 0
         values = np.where(there, weights * brings[rows, items] / np.where(there, pdfs, 1), 0.0)
-        chances = np.stack([pdfs, weights, others], axis=-1).reshape(-1, 3)
-        given = [array(items.ravel()), explores, array(alone.ravel()), array(chances, wp.vec3)]
+        chances = np.stack([pdfs, weights, others, np.ones_like(pdfs)], axis=-1).reshape(-1, 4)
+        given = [array(items.ravel()), explores, array(alone.ravel()), array(chances, wp.vec4)]
         given += [array(np.where(values > 0, 1, -1).ravel()), array(values.ravel(), wp.float32)]
         launch(keep_lights, items.size, [regions, *given], device())
     settings = light_cache_build.CacheSettings()

@@ -11,7 +11,7 @@ from warp_gi import launch
 from warp_gi.errors import OptionError, check_whole
 from warp_gi.kernels import guided_directions, guided_shares, quadtree, quadtree_adapt
 from warp_gi.techniques.paths.estimators import BsdfPaths
-from warp_gi.techniques.reuse.rest import GUIDE_COST, Rest, frame_gains, woken_by
+from warp_gi.techniques.reuse.rest import GUIDE_COST, Rest, frame_gains, wish_for_lesson, woken_by
 from warp_gi.techniques.reuse.sample_octree import Lesson, SampleOctree
 
 if TYPE_CHECKING:
@@ -104,6 +104,7 @@ class GuidedPaths(BsdfPaths):
         data.trees, data.shares, data.counts = state.guides.trees, state.guides.shares, state.counts
         data.anchors = state.guides.anchors
         frame.paths.use_directions(guided_directions.GUIDED_DIRECTIONS, data)
+        wish_for_lesson(frame, state.rest)
         return state
 
     def after(self, frame: Frame, state: GuideState) -> GuideState:
@@ -115,7 +116,7 @@ class GuidedPaths(BsdfPaths):
                 state if lesson is None else self._counted(self._taken_over(lesson, state), lesson.device, state.rest)
             )
         if lesson is None:
-            return state
+            return replace(state, rest=state.rest.skipped())
         if self.rests:
             gains = frame_gains(frame, lesson)
             rest = state.rest.judged(gains.directions, gains.variance, GUIDE_COST, frame.scene.is_animated)

@@ -16,7 +16,7 @@ from warp_gi.kernels import light_cache, light_cache_build, light_cache_native
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.emitters import PlacedEmitters
 from warp_gi.techniques.light_hierarchy.estimator import LightHierarchy, TreeState, first_tree, moved_tree
-from warp_gi.techniques.reuse.rest import CACHE_COST, Rest, frame_gains, woken_by
+from warp_gi.techniques.reuse.rest import CACHE_COST, Rest, frame_gains, wish_for_lesson, woken_by
 from warp_gi.techniques.reuse.sample_octree import Lesson, SampleOctree, running_sums
 from warp_gi.techniques.shared.ltc import ltc_table
 
@@ -158,6 +158,7 @@ class VisibilityLightCache(Estimator):
         else:
             table = AliasTable.build(self._table(scene, frame.camera, moved, state.places[:, :3])).on(device)
         frame.paths.use_lights(light_cache.CACHED_LIGHTS, cache, table)
+        wish_for_lesson(frame, state.rest)
         return state
 
     def _tables(self, leaves: int, device: wp.Device) -> light_cache.CacheTables:
@@ -205,7 +206,7 @@ class VisibilityLightCache(Estimator):
             state = replace(state, rest=state.rest.rested())
             return state if lesson is None else self._taken_over(lesson, state)
         if lesson is None:
-            return state
+            return replace(state, rest=state.rest.skipped())
         if self.rests:
             gains = frame_gains(frame, lesson)
             rest = state.rest.judged(gains.lights, gains.variance, CACHE_COST, frame.scene.is_animated)

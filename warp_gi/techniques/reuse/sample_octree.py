@@ -101,8 +101,12 @@ class SampleOctree(Service):
         with frame.stage(f"preprocess {self.name}"):
             regions = sample_kernels.SampleRegions()
             regions.octree, regions.moves = state.octree, int(frame.scene.is_animated)
-            vertices = min(paths.max_depth - 1, MOST_VERTICES)
-            regions.records = self.records(frame, vertices, state.spare.take())
+            wish = frame.offered(LessonWish)
+            if wish is None or wish.is_wanted:
+                vertices = min(paths.max_depth - 1, MOST_VERTICES)
+                regions.records = self.records(frame, vertices, state.spare.take())
+            else:
+                regions.records.stride = 1  # and no vertices
         return regions
 
     def after(self, frame: Frame, state: OctreeState) -> OctreeState:
@@ -110,6 +114,8 @@ class SampleOctree(Service):
         if frame.paths.regions.sampler is not sample_kernels.SAMPLE_REGIONS:
             return state
         records = frame.paths.regions.data.records
+        if not records.vertices:
+            return state
         lesson = self.learn(state, records, frame.device)
         frame.offer(lesson)
         lesson.octree.spare.give(records)
@@ -237,6 +243,14 @@ class Motion:
 
     begins: bool
     """Whether lights move in this frame that did not in the last one."""
+
+
+@dataclass(frozen=True)
+class LessonWish:
+    """What estimators offer in ``preprocess`` that need not learn from every frame."""
+
+    is_wanted: bool
+    """Whether one of them wants to learn from the frame. If not, none of its samples are kept."""
 
 
 @dataclass
