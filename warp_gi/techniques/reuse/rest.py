@@ -31,11 +31,11 @@ PROMISING = 0.6
 """Share of the gain that is needed from which on a trial goes on."""
 KEPT = 0.7
 """Share of the gain that is needed below which a technique in use rests."""
-FIRST_REST, LONGEST_REST, LONGEST_REST_MOVING = 8, 128, 32
+FIRST_REST, LONGEST_REST, LONGEST_REST_MOVING = 8, 128, 64
 """Frames of the first rest, which double with each, and of the longest, where nothing moves and where things do."""
 SETTLED = 10
 """Frames of use from which on only every second one leaves samples to learn from, where nothing moves."""
-WAKING = 48
+WAKING = 96
 """Frames of rest that allow for a trial ahead of time, when lights begin to move; the first is given."""
 LEARNING_FADING, FADING = 0.5, 0.95
 """Share of sums that stays from frame to frame: in a trial in which gains grow, and else."""
