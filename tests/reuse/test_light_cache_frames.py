@@ -482,7 +482,7 @@ def test_scene_without_lights():
     grey = gi.Material("grey", (0.5, 0.5, 0.5), specular=0.0)
     scene = gi.Scene([gi.Node("floor", [quad((-3, 0, -3), (0, 0, 6), (6, 0, 0), grey)])], environment=(1.0, 1.0, 1.0))
     camera = gi.CameraPath.still(gi.Camera.look_at((0, 1, 0.5), (0, 0, 0), hfov=40, resolution=(16, 16)))
-    pipeline = gi.Pipeline(emitters=gi.VisibilityLightCache(), indirect=None, spp=1)
+    pipeline = gi.Pipeline(emitters=gi.VisibilityLightCache(rests=False), indirect=None, spp=1)
     for frame in gi.render(scene, camera, pipeline, frames=range(2), device=str(device())):
         assert np.allclose(frame.numpy("beauty"), 0.5, rtol=1e-4)
 
@@ -503,7 +503,9 @@ def by_hierarchy(moves, name):
 )
 def test_pictures_equal_those_of_the_hierarchy(moves, explores_by):
     """The first frame, in which nothing is known, and the sixth; and the cache is worth it: lamps are hidden."""
-    ours = rendered(divided_room(moves), gi.VisibilityLightCache(explores_by=explores_by), range(1, 25), (0, 5))
+    ours = rendered(
+        divided_room(moves), gi.VisibilityLightCache(explores_by=explores_by, rests=False), range(1, 25), (0, 5)
+    )
     theirs = by_hierarchy(moves, device().alias)
     for buffer in ours:
         for k, index in enumerate((0, 5)):

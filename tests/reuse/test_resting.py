@@ -12,7 +12,7 @@ from statistics_tools import device, every_device  # noqa: F401
 import warp_gi as gi
 from warp_gi.bench.harness import scenes
 from warp_gi.kernels import octree, reuse_gains, samples
-from warp_gi.launch import launch, on_device
+from warp_gi.launch import launch, on_device, set_threads
 from warp_gi.techniques.reuse import rest
 from warp_gi.techniques.reuse.rest import CACHE_COST, GUIDE_COST, Gains, Rest
 
@@ -89,6 +89,16 @@ def test_resting_frames_are_those_of_the_plain_samplers(fifty):
         assert same(frames[index], plain.frame(index)) == resting == (index not in (0, 14)), index
 
 
+def test_threads_change_no_decision(fifty):
+    _, frames = fifty
+    try:
+        set_threads(3)
+        ours = box_scheduler()
+        assert all(same(ours.frame(index), frames[index]) for index in range(18))
+    finally:
+        set_threads(None)
+
+
 def test_it_may_be_forbidden():
     ours = scheduler(
         emitters=gi.VisibilityLightCache(rests=False), indirect=gi.GuidedPaths(max_depth=5, rests=False), spp=1
@@ -97,13 +107,19 @@ def test_it_may_be_forbidden():
 
 
 def test_many_lights_that_few_points_see_keep_the_cache():
-    """The warehouse: the cache stays, guiding rests, and what it knows follows the cache's tree."""
+    """The warehouse: the cache stays, guiding rests, and what it knows follows the cache's tree.
+
+    Once settled, every second frame leaves no samples.
+    """
     path = gi.builtin_camera_path("warehouse").at_resolution(96, 54)
     pipeline = gi.Pipeline.preset("reuse", spp=2)
     ours = gi.FrameScheduler(gi.builtin_scene("warehouse"), path.camera(0), pipeline, device().alias, 3)
-    names = [used(ours.frame(index)) for index in range(14)]
+    frames = [ours.frame(index) for index in range(22)]
+    names = [used(frame) for frame in frames]
     assert {lights for lights, _ in names} == {"cache"}
-    assert {directions for _, directions in names[-4:]} == {"bsdf"}
+    assert [directions for _, directions in names] == ["guided"] * 6 + ["bsdf"] * 8 + ["guided"] + ["bsdf"] * 7
+    kept = [frame.paths.regions.data.records.vertices > 0 for frame in frames]
+    assert kept == [True] * 17 + [False, True, False, True, False]
     leaves = ours.state("octree").leaf_count
     guides = ours.state("indirect").guides
     assert guides.trees.shape == (leaves,) and guides.energies.shape == (leaves * 4 * 128,)
