@@ -28,6 +28,7 @@ class LightChoice:
     explores: wp.int32  # found by exploring: 1; 2, where the cache selects the light more often than that
     alone: wp.int32  # 1: by exploring, as the only choice there is
     other: wp.float32  # probability of it by exploring alone; if `alone`, by the cache, below 0 where nobody asked
+    selected: wp.float32  # part of selecting it in the density of the direction, the rest being the direction sampler's
 
 
 # radiance is over pdf already for lights without size (delta = 1), whose pdf is the

@@ -102,6 +102,30 @@ def list_seen_lights(first: wp.int32, samples: LeafSamples, lights: wp.array(dty
     seen.counts[leaf] = found
 
 
+# Thread: a leaf. Takes over what its leaf of the last tree knew, whose lists and buckets both read from then on.
+@wp.kernel
+def take_over_lights(
+    first: wp.int32,
+    origins: wp.array(dtype=wp.int32),
+    known: LightLists,
+    known_tables: CacheTables,
+    lists: LightLists,
+    tables: CacheTables,
+):
+    leaf = first + wp.tid()
+    origin = origins[leaf]
+    if origin < 0:  # the arrays hold what is known at first
+        return
+    lists.offsets[leaf] = known.offsets[origin]
+    lists.counts[leaf] = known.counts[origin]
+    tables.buckets[leaf] = known_tables.buckets[origin]
+    tables.offsets[leaf] = known_tables.offsets[origin]
+    tables.exploration[leaf] = known_tables.exploration[origin]
+    tables.alone[leaf] = known_tables.alone[origin]
+    tables.moments[leaf] = known_tables.moments[origin]
+    tables.excesses[leaf] = known_tables.excesses[origin]
+
+
 # Thread: a leaf. Writes the largest length that its joined list can have.
 @wp.kernel
 def bound_lists(

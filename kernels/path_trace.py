@@ -329,9 +329,12 @@ def _made(
                         light = wp.vec3(0.0, 0.0, 0.0)
                         if sample.arrives > 0:
                             light = sample.reflected * (choice.weight / emitter_share)
+                            choice.selected = 1.0
                             if sample.delta == 0:
                                 pdf = directions.pdf(samplers.directions, region, s, sample.direction, sample.bsdf_pdf)
-                                light = sample.reflected * (choice.weight / (sample.pdf * emitter_share + pdf))
+                                by_light = sample.pdf * emitter_share
+                                light = sample.reflected * (choice.weight / (by_light + pdf))
+                                choice.selected = by_light / (by_light + pdf)
                         if at_first:
                             r.emitters = r.emitters + light
                             if paths.lobes != 0:

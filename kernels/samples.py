@@ -134,10 +134,12 @@ def keep_light(data: SampleRegions, slot: wp.int32, choice: LightChoice, visible
     if choice.alone != 0:
         data.records.rivals[slot] = choice.other / wp.max(choice.pdf, LEAST_PROBABILITY)
     elif visible > 0:
-        # With one choice the light would have brought `light` times pdf / (weight * other), and been selected `other`
-        # times instead of pdf / weight. Both choices are independent: their product estimates that of their means,
-        # which a variance loses when one choice is made of both.
-        excess = light * light * (1.0 - choice.pdf / (choice.weight * wp.max(choice.other, LEAST_PROBABILITY)))
+        # By exploring alone the light would be selected `other` / pdf times as often, and bring `brings` times as much:
+        # the direction sampler, which may find it too, bounds that. Both choices are independent: their product
+        # estimates that of their means, which a variance loses when one choice is made of both.
+        other = wp.max(choice.other, LEAST_PROBABILITY) / choice.pdf
+        brings = 1.0 / (choice.selected * other + 1.0 - choice.selected)
+        excess = light * light * (1.0 - other * brings * brings / choice.weight)
         if choice.explores != 0 and (before & LIGHT_VISIBLE) != wp.uint32(0):
             excess += 2.0 * light * data.records.light_values[slot]
         data.records.rivals[slot] = data.records.rivals[slot] + excess

@@ -195,7 +195,10 @@ class LampSamples:
 # Sample k of a slot.
 @wp.func
 def lamp_choice(scene: SceneData, lamps: LampSamples, index: wp.uint32, k: wp.int32) -> LightChoice:
-    choice = LightChoice(k, 1.0, 1.0, 0, 0, 0.0)
+    choice = LightChoice()
+    choice.item = k
+    choice.pdf = 1.0
+    choice.weight = 1.0
     if lamps.each == 0:
         u = sample_1d(index, lamps.seed, TRANSFER_LAMP_DIMENSION)
         digits = random_1d(index, lamps.seed, TRANSFER_LAMP_DIMENSION)

@@ -95,7 +95,7 @@ def choose_lights(
     )
 
 
-# Thread: a slot. Keeps a light sample as paths do; `chances` are LightChoice's pdf, weight and other.
+# Thread: a slot. Keeps a light sample as paths do; `chances` are LightChoice's pdf, weight, other and selected.
 @wp.kernel
 def keep_lights(
     first: wp.int32,
@@ -103,7 +103,7 @@ def keep_lights(
     items: wp.array(dtype=wp.int32),
     explores: wp.int32,
     alone: wp.array(dtype=wp.int32),
-    chances: wp.array(dtype=wp.vec3),
+    chances: wp.array(dtype=wp.vec4),
     arrives: wp.array(dtype=wp.int32),
     values: wp.array(dtype=wp.float32),
 ):
@@ -115,6 +115,7 @@ def keep_lights(
     choice.pdf = chances[slot][0]
     choice.weight = chances[slot][1]
     choice.other = chances[slot][2]
+    choice.selected = chances[slot][3]
     samples.keep_light(regions, slot, choice, arrives[slot], values[slot])
 
 
@@ -226,6 +227,8 @@ def preprocessed(scene, estimator=None, state=None, time=0.0, position=(0.0, 1.0
         camera=SimpleNamespace(position=position),
         paths=PathRequest(data.emitters),
         launch=lambda kernel, inputs, count: launch(kernel, count, inputs, device()),
+        offer=lambda thing: None,
+        offered=lambda kind: None,
     )
     state = estimator.preprocess(frame, state)
     return frame, state

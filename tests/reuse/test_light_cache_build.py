@@ -687,8 +687,8 @@ def learnt_exploration(contents, unseen=(), frames=3):
             there = items >= 0
             values = np.where(there, weights * light[np.arange(places)[:, None], items] / np.where(there, pdfs, 1), 0.0)
             arrives = np.where(values > 0, 1, -1)
-            chances = np.stack([pdfs, weights, others], axis=-1).reshape(-1, 3)
-            given = [array(items.ravel()), explores, array(np.zeros(items.size)), array(chances, wp.vec3)]
+            chances = np.stack([pdfs, weights, others, np.ones_like(pdfs)], axis=-1).reshape(-1, 4)
+            given = [array(items.ravel()), explores, array(np.zeros(items.size)), array(chances, wp.vec4)]
             given += [array(arrives.ravel()), array(values.ravel(), wp.float32)]
             launch(keep_lights, items.size, [regions, *given], device())
         inputs = [settings_of(), grouped, regions.records, nothing, nothing, np.arange(places), known]

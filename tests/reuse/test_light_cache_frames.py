@@ -225,7 +225,7 @@ def test_kept_lights():
     items[rng.random((2, count)) < 0.3] = -1
     values = np.where(arrives > 0, rng.random((2, count)), 0.0)
     glossy = np.where(rng.random(count) < 0.3, GLOSSY, 0)
-    chances = np.float32(rng.uniform(0.1, 1, (2, count, 3)))  # pdf, weight, other
+    chances = np.float32(rng.uniform(0.1, 1, (2, count, 4)))  # pdf, weight, other, selected
     chances[0, :100, 2] = -1.0  # where exploring is alone: unknown
     alone = np.zeros((2, count), int)
     alone[0, :200] = 1
@@ -233,7 +233,7 @@ def test_kept_lights():
     regions = samples.SampleRegions()
     regions.records = records_of(glossy, np.full(count, -3.0))
     for k in range(2):
-        given = [array(items[k]), k, array(alone[k]), array(chances[k], wp.vec3)]
+        given = [array(items[k]), k, array(alone[k]), array(chances[k], wp.vec4)]
         given += [array(arrives[k]), array(values[k], wp.float32)]
         launch(keep_lights, count, [regions, *given], device())
     found, kept = regions.records, []
@@ -253,9 +253,11 @@ def test_kept_lights():
             rival = chances[0, slot, 2] / chances[0, slot, 0] if items[0, slot] >= 0 else 0.0
         else:
             light_of = np.where((items[:, slot] >= 0) & (arrives[:, slot] == 1), values[:, slot], 0.0)
-            pdf, weight, other = chances[:, slot].astype(float).T
-            # that would have brought pdf / (weight * other) as much, and found it as much more rarely
-            rival = light_of.sum() ** 2 - (light_of**2 * pdf / (weight * other)).sum()
+            pdf, weight, other, selected = chances[:, slot].astype(float).T
+            # the density of the direction sampler, which may find the light too, stays as it is
+            density, times = selected / pdf * other + (1 - selected), weight / pdf
+            alone_brings = light_of / weight / density
+            rival = light_of.sum() ** 2 - (alone_brings**2 * times * other).sum()
         assert np.isclose(rivals[slot], rival, rtol=1e-4, atol=1e-4), slot
     assert set(kept) == {0, VISIBLE, BLOCKED, VISIBLE | EXPLORED, ALONE, VISIBLE | ALONE, BLOCKED | ALONE}
 
@@ -480,7 +482,7 @@ def test_scene_without_lights():
     grey = gi.Material("grey", (0.5, 0.5, 0.5), specular=0.0)
     scene = gi.Scene([gi.Node("floor", [quad((-3, 0, -3), (0, 0, 6), (6, 0, 0), grey)])], environment=(1.0, 1.0, 1.0))
     camera = gi.CameraPath.still(gi.Camera.look_at((0, 1, 0.5), (0, 0, 0), hfov=40, resolution=(16, 16)))
-    pipeline = gi.Pipeline(emitters=gi.VisibilityLightCache(), indirect=None, spp=1)
+    pipeline = gi.Pipeline(emitters=gi.VisibilityLightCache(rests=False), indirect=None, spp=1)
     for frame in gi.render(scene, camera, pipeline, frames=range(2), device=str(device())):
         assert np.allclose(frame.numpy("beauty"), 0.5, rtol=1e-4)
 
@@ -501,7 +503,9 @@ def by_hierarchy(moves, name):
 )
 def test_pictures_equal_those_of_the_hierarchy(moves, explores_by):
     """The first frame, in which nothing is known, and the sixth; and the cache is worth it: lamps are hidden."""
-    ours = rendered(divided_room(moves), gi.VisibilityLightCache(explores_by=explores_by), range(1, 25), (0, 5))
+    ours = rendered(
+        divided_room(moves), gi.VisibilityLightCache(explores_by=explores_by, rests=False), range(1, 25), (0, 5)
+    )
     theirs = by_hierarchy(moves, device().alias)
     for buffer in ours:
         for k, index in enumerate((0, 5)):

@@ -114,7 +114,9 @@ def ratio(ours, theirs):
 def test_lights_beyond_the_capacity_vary_no_more_than_by_the_hierarchy(settings):
     """From the third frame on. (With the cache and exploring beside it everywhere: 1.4 to 3.3 times.)"""
     scene, seeds, frames = wall_of_lamps(**settings), range(1, 9), range(3, 14)
-    ours, theirs = (rendered(scene, e, seeds, frames) for e in (gi.VisibilityLightCache(), gi.LightHierarchy()))
+    ours, theirs = (
+        rendered(scene, e, seeds, frames) for e in (gi.VisibilityLightCache(rests=False), gi.LightHierarchy())
+    )
     assert ratio(ours, theirs) <= BOUND + NOISE, ratio(ours, theirs)
 
 
@@ -122,14 +124,17 @@ def test_lights_beyond_the_capacity_vary_no_more_than_by_the_hierarchy(settings)
 def test_hidden_lights_are_still_worth_the_cache(side):
     """Half of them is behind a screen."""
     scene, seeds, frames = wall_of_lamps(side, hidden=0.5), range(1, 9), range(16, 22)
-    ours, theirs = (rendered(scene, e, seeds, frames) for e in (gi.VisibilityLightCache(), gi.LightHierarchy()))
+    ours, theirs = (
+        rendered(scene, e, seeds, frames) for e in (gi.VisibilityLightCache(rests=False), gi.LightHierarchy())
+    )
     assert ratio(ours, theirs) < 0.5, ratio(ours, theirs)
 
 
 def test_regions_of_one_picture_decide_by_themselves():
     """One hall sees thousands of lights, the other a few of many."""
     ours, theirs = (
-        rendered(two_halls(), e, range(1, 9), SETTLED) for e in (gi.VisibilityLightCache(), gi.LightHierarchy())
+        rendered(two_halls(), e, range(1, 9), SETTLED)
+        for e in (gi.VisibilityLightCache(rests=False), gi.LightHierarchy())
     )
     many, few = np.s_[..., : SIZE[0] // 2 - 1], np.s_[..., SIZE[0] // 2 + 1 :]
     assert ratio(ours[many], theirs[many]) <= BOUND + NOISE
@@ -140,7 +145,7 @@ def test_regions_of_one_picture_decide_by_themselves():
 def test_means_are_those_of_the_hierarchy(settings):
     """In frames in which nothing is known, in which some regions have changed their way, and in which they rest."""
     scene, frames = wall_of_lamps(**settings), (0, 5, 30)
-    ours = rendered(scene, gi.VisibilityLightCache(), range(1, 13), frames)
+    ours = rendered(scene, gi.VisibilityLightCache(rests=False), range(1, 13), frames)
     ours = np.stack([in_grey(ours[:, [k]]) for k in range(len(frames))], axis=1)
     mean, variance = st.mean_and_variance(in_grey(rendered(scene, gi.LightHierarchy(), range(101, 109), range(12))))
     for k, index in enumerate(frames):
@@ -155,7 +160,7 @@ def in_grey(luminances):
 def test_the_first_frame_is_the_hierarchys():
     """Nothing is known; the same lights are selected by the same numbers."""
     scene = wall_of_lamps(10)
-    ours, theirs = (rendered(scene, e, (3,), (0,)) for e in (gi.VisibilityLightCache(), gi.LightHierarchy()))
+    ours, theirs = (rendered(scene, e, (3,), (0,)) for e in (gi.VisibilityLightCache(rests=False), gi.LightHierarchy()))
     assert np.allclose(ours, theirs, rtol=1e-4, atol=1e-6) and ours.max() > 0.1
 
 
@@ -216,8 +221,8 @@ def learnt_excess(frame, data, spots, brings, count, rng):
         items, pdfs, weights, _, alone, others = choices(frame, data, spots, numbers, explores)
         there = items >= 0
         values = np.where(there, weights * brings[rows, items] / np.where(there, pdfs, 1), 0.0)
-        chances = np.stack([pdfs, weights, others], axis=-1).reshape(-1, 3)
-        given = [array(items.ravel()), explores, array(alone.ravel()), array(chances, wp.vec3)]
+        chances = np.stack([pdfs, weights, others, np.ones_like(pdfs)], axis=-1).reshape(-1, 4)
+        given = [array(items.ravel()), explores, array(alone.ravel()), array(chances, wp.vec4)]
         given += [array(np.where(values > 0, 1, -1).ravel()), array(values.ravel(), wp.float32)]
         launch(keep_lights, items.size, [regions, *given], device())
     settings = light_cache_build.CacheSettings()

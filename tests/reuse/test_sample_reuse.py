@@ -17,6 +17,7 @@ SIZE = (24, 16)
 SPP = 8
 OCTREE = gi.SampleOctree(split=192, collapse=96)
 TERMS = ("environment", "emitters", "indirect")
+CACHED, GUIDED = gi.VisibilityLightCache(rests=False), gi.GuidedPaths(max_depth=5, rests=False)
 GLOSSY = gi.Material("glossy", (0.9, 0.7, 0.4), metallic=1.0, roughness=0.3)
 COATED = gi.Material("coated", (0.3, 0.5, 0.7), roughness=0.5)
 
@@ -58,7 +59,7 @@ def view():
 
 
 def pipeline(**settings):
-    settings = {"emitters": gi.VisibilityLightCache(), "indirect": gi.GuidedPaths(max_depth=5), **settings}
+    settings = {"emitters": CACHED, "indirect": GUIDED, **settings}
     return gi.Pipeline(**{"spp": SPP, "octree": OCTREE, **settings})
 
 
@@ -110,17 +111,19 @@ def test_unbiased_in_every_frame(references, last, moving):
     same_pictures(f"reuse_{last}_{moving}", references, moving, frames, pipeline())
 
 
-@pytest.mark.parametrize("change", ["paper", "leaf", "table", "indirect alone"])
+@pytest.mark.parametrize("change", ["paper", "leaf", "table", "indirect alone", "rests"])
 def test_other_ways_are_unbiased_too(references, change):
-    """The paper's settings; a leaf picked by a third number; exploration by a table; directions without a cache."""
+    """The paper's settings; a leaf picked by a third number; exploration by a table; directions without a cache; and
+    a frame that tries again after a rest, or is in use."""
     paper = gi.GuidedPaths(max_depth=5, migrations=1, adapts_share=False, stratified=False, bits=32, fading=0.0)
     chosen = {
         "paper": pipeline(indirect=paper),
         "leaf": pipeline(indirect=gi.GuidedPaths(max_depth=5, stratified=False, bits=64)),
         "table": pipeline(emitters=gi.VisibilityLightCache(explores_by="table", capacity=6)),
         "indirect alone": pipeline(emitters=gi.PowerLights(), indirect=gi.GuidedPaths(max_depth=5, bits=96)),
+        "rests": pipeline(emitters=gi.VisibilityLightCache(), indirect=gi.GuidedPaths(max_depth=5)),
     }[change]
-    same_pictures(f"reuse_{change}", references, False, [*range(5)], chosen)
+    same_pictures(f"reuse_{change}", references, False, [*range(16 if change == "rests" else 5)], chosen)
 
 
 @pytest.mark.parametrize("moving", [False, True], ids=["still", "moving"])

@@ -24,15 +24,17 @@ PAPER_PASSES = (
 PAPER_PATHS = (("LH", 11.2), ("SLL", 15.1), ("VLC", 15.1), ("VLC + CDQ", 17.1))
 BASELINE = "LightHierarchy + BsdfPaths"
 BOTH = "VisibilityLightCache + GuidedPaths"
+CACHED, GUIDED = gi.VisibilityLightCache(rests=False), gi.GuidedPaths(rests=False)
+"""As in the paper, in every frame."""
 
 
 def pipelines() -> dict[str, gi.Pipeline]:
     """Return the pipelines that the paper's figure 12 compares, by name."""
     choices = {
         BASELINE: (gi.LightHierarchy(), gi.BsdfPaths()),
-        "LightHierarchy + GuidedPaths": (gi.LightHierarchy(), gi.GuidedPaths()),
-        "VisibilityLightCache + BsdfPaths": (gi.VisibilityLightCache(), gi.BsdfPaths()),
-        BOTH: (gi.VisibilityLightCache(), gi.GuidedPaths()),
+        "LightHierarchy + GuidedPaths": (gi.LightHierarchy(), GUIDED),
+        "VisibilityLightCache + BsdfPaths": (CACHED, gi.BsdfPaths()),
+        BOTH: (CACHED, GUIDED),
     }
     return {
         name: gi.Pipeline(emitters=emitters, indirect=indirect, spp=1, camera_samples=1)

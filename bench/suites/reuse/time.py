@@ -54,7 +54,9 @@ def place_adaptation(place: Case, size: tuple[int, int], spp: int, seeds: int, l
     scene, camera = place.scene(), place.camera().at_resolution(*size)
     truth = Truth(scene, camera, device, spp)
     choices = {
-        "VisibilityLightCache + GuidedPaths": _pipeline(gi.VisibilityLightCache(), gi.GuidedPaths()),
+        "VisibilityLightCache + GuidedPaths": _pipeline(
+            gi.VisibilityLightCache(rests=False), gi.GuidedPaths(rests=False)
+        ),
         "baseline": _pipeline(gi.LightHierarchy(), gi.BsdfPaths()),
     }
     runs = [
@@ -107,7 +109,7 @@ def turn_rows(
     choices = {"baseline": _pipeline(gi.LightHierarchy(), gi.BsdfPaths())}
     for count in bits:
         for migrations in TARGET_TURNING:
-            guided = gi.GuidedPaths(bits=count, migrations=migrations)
+            guided = gi.GuidedPaths(bits=count, migrations=migrations, rests=False)
             choices[f"{count} {migrations}"] = _pipeline(gi.LightHierarchy(), guided)
     runs = [
         run_sequences(
@@ -142,8 +144,10 @@ def strobe_rows(quick: bool, device: str) -> list[Row]:
     """Return errors over frames with a lamp that jumps in and out of a box, and one that passes slits."""
     size, spp, cycles = ((80, 45), 48, 2) if quick else ((120, 68), 192, 4)
     choices = {
-        "VisibilityLightCache + GuidedPaths": _pipeline(gi.VisibilityLightCache(), gi.GuidedPaths()),
-        "VisibilityLightCache + BsdfPaths": _pipeline(gi.VisibilityLightCache(), gi.BsdfPaths()),
+        "VisibilityLightCache + GuidedPaths": _pipeline(
+            gi.VisibilityLightCache(rests=False), gi.GuidedPaths(rests=False)
+        ),
+        "VisibilityLightCache + BsdfPaths": _pipeline(gi.VisibilityLightCache(rests=False), gi.BsdfPaths()),
         "baseline": _pipeline(gi.LightHierarchy(), gi.BsdfPaths()),
     }
     rows: list[Row] = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import warp as wp
@@ -11,6 +11,7 @@ from warp_gi import launch
 from warp_gi.errors import OptionError, check_whole
 from warp_gi.kernels import guided_directions, guided_shares, quadtree, quadtree_adapt
 from warp_gi.techniques.paths.estimators import BsdfPaths
+from warp_gi.techniques.reuse.rest import GUIDE_COST, Rest, frame_gains, wish_for_lesson, woken_by
 from warp_gi.techniques.reuse.sample_octree import Lesson, SampleOctree
 
 if TYPE_CHECKING:
@@ -53,6 +54,9 @@ class GuidedPaths(BsdfPaths):
     (True), or by a third number that picks a leaf, as in the paper (False)."""
     samples: int = 2048
     """Largest number of samples that a region learns from in a frame."""
+    rests: bool = True
+    """Whether frames leave directions to the BSDF, record nothing and learn nothing, while that has less variance for
+    its time; a frame in 8, then in 16, ... 128 tries again. False: every frame uses the quadtrees."""
 
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
@@ -88,21 +92,36 @@ class GuidedPaths(BsdfPaths):
         guides = _guides(8, self.bits, target)
         guides.trees.fill_(wp.vec4ui(*quadtree.quadtree_uniform(self.bits)))
         guides.shares.fill_(wp.vec2(self.bsdf_share, self.bsdf_share))
-        return self._counted(guides, target)
+        return self._counted(guides, target, Rest())
 
     def preprocess(self, frame: Frame, state: GuideState) -> GuideState:
-        """Let paths draw directions from the quadtrees, and return the state as it is."""
+        """Let paths draw directions from the quadtrees, unless they rest."""
+        state = replace(state, rest=woken_by(frame, state.rest))
+        if state.rest.is_resting:
+            return state
         data = guided_directions.GuidedDirections()
         data.bits, data.stratified = self.bits, int(self.stratified)
         data.trees, data.shares, data.counts = state.guides.trees, state.guides.shares, state.counts
         data.anchors = state.guides.anchors
         frame.paths.use_directions(guided_directions.GUIDED_DIRECTIONS, data)
+        wish_for_lesson(frame, state.rest)
         return state
 
     def after(self, frame: Frame, state: GuideState) -> GuideState:
-        """Return quadtrees that learnt from the samples of the frame, if any were kept."""
+        """Return quadtrees that learnt from the samples of the frame, if any were kept, and whether they rest next."""
         lesson = frame.offered(Lesson)
-        return state if lesson is None else self.learn(lesson, state)
+        if state.rest.is_resting:
+            state = replace(state, rest=state.rest.rested())
+            return (
+                state if lesson is None else self._counted(self._taken_over(lesson, state), lesson.device, state.rest)
+            )
+        if lesson is None:
+            return replace(state, rest=state.rest.skipped())
+        if self.rests:
+            gains = frame_gains(frame, lesson)
+            rest = state.rest.judged(gains.directions, gains.variance, GUIDE_COST, frame.scene.is_animated)
+            state = replace(state, rest=rest)
+        return self.learn(lesson, state)
 
     def learn(self, lesson: Lesson, state: GuideState) -> GuideState:
         """Return quadtrees for the next frame's leaves, adapted to the samples of this one."""
@@ -111,11 +130,8 @@ class GuidedPaths(BsdfPaths):
             raise OptionError(
                 f"{lesson.octree.leaf_count:,} leaves are too many for {self.bits} bits; raise octree.split"
             )
-        guides = _guides(lesson.octree.leaf_count, self.bits, device)
-        uniform = wp.vec4ui(*quadtree.quadtree_uniform(self.bits))
+        guides = self._taken_over(lesson, state)
         cells = [lesson.octree.octree, lesson.tree]
-        inputs = [lesson.origins, state.guides, guides, uniform, self.bsdf_share, *cells]
-        lesson.launch(guided_shares.take_over_guides, inputs)
         samples = lesson.leaf_samples(self.samples)
         inputs = [samples, lesson.records, guides, *cells, self.bsdf_share, int(self.adapts_share)]
         lesson.launch(guided_shares.adapt_shares, inputs)
@@ -126,7 +142,16 @@ class GuidedPaths(BsdfPaths):
         for name in ("codes", "directions", "contributions", "pdfs"):
             setattr(records, name, getattr(lesson.records, name))
         lesson.launch(quadtree_adapt.adapt_quadtrees, [records, adaptation])
-        return GuideState(guides, adaptation.counts)
+        return replace(state, guides=guides, counts=adaptation.counts)
+
+    def _taken_over(self, lesson: Lesson, state: GuideState) -> guided_shares.GuideKnowledge:
+        """Return what is known, by the leaves of the next frame's tree."""
+        guides = _guides(lesson.octree.leaf_count, self.bits, lesson.device)
+        uniform = wp.vec4ui(*quadtree.quadtree_uniform(self.bits))
+        cells = [lesson.octree.octree, lesson.tree]
+        inputs = [lesson.origins, state.guides, guides, uniform, self.bsdf_share, *cells]
+        lesson.launch(guided_shares.take_over_guides, inputs)
+        return guides
 
     def _adaptation(self, guides: guided_shares.GuideKnowledge, device: wp.Device) -> quadtree_adapt.QuadtreeAdaptation:
         """Return the settings of an adaptation of quadtrees, with room for its counts."""
@@ -139,14 +164,14 @@ class GuidedPaths(BsdfPaths):
         adaptation.energies, adaptation.fading = guides.energies, self.fading
         return adaptation
 
-    def _counted(self, guides: guided_shares.GuideKnowledge, device: wp.Device) -> GuideState:
+    def _counted(self, guides: guided_shares.GuideKnowledge, device: wp.Device, rest: Rest) -> GuideState:
         """Return a state of quadtrees as they are, with the counts that follow from them."""
         adaptation = self._adaptation(guides, device)
         none = quadtree_adapt.QuadtreeSamples()
         leaves = guides.trees.shape[0]
         none.starts = none.counts = wp.zeros(leaves, dtype=wp.int32, device=device)
         launch.launch(quadtree_adapt.adapt_quadtrees, leaves, [none, adaptation], device)
-        return GuideState(guides, adaptation.counts)
+        return GuideState(guides, adaptation.counts, rest)
 
 
 @dataclass
@@ -157,6 +182,8 @@ class GuideState:
     """Quadtrees, shares of directions by the BSDF, and what both are learnt from, by leaf of the octree."""
     counts: wp.array
     """uint32 [leaf * bits / 4]: numbers of leaves below nodes of the quadtrees, which follow from the trees."""
+    rest: Rest = field(default_factory=Rest)
+    """Whether frames use the quadtrees."""
 
 
 def _guides(leaves: int, bits: int, device: wp.Device) -> guided_shares.GuideKnowledge:

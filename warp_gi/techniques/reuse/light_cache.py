@@ -15,7 +15,8 @@ from warp_gi.estimator import Estimator
 from warp_gi.kernels import light_cache, light_cache_build, light_cache_native
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.emitters import PlacedEmitters
-from warp_gi.techniques.light_hierarchy.estimator import TreeState, first_tree, moved_tree
+from warp_gi.techniques.light_hierarchy.estimator import LightHierarchy, TreeState, first_tree, moved_tree
+from warp_gi.techniques.reuse.rest import CACHE_COST, Rest, frame_gains, wish_for_lesson, woken_by
 from warp_gi.techniques.reuse.sample_octree import Lesson, SampleOctree, running_sums
 from warp_gi.techniques.shared.ltc import ltc_table
 
@@ -70,6 +71,9 @@ class VisibilityLightCache(Estimator):
     """Weight in the table of a light's nearness to the camera."""
     samples: int = 2048
     """Largest number of samples that a region learns from in a frame."""
+    rests: bool = True
+    """Whether frames leave the choice to ``LightHierarchy``, record nothing and learn nothing, while that has less
+    variance for its time; a frame in 8, then in 16, ... 128 tries again. False: every frame uses the cache."""
 
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
@@ -134,6 +138,10 @@ class VisibilityLightCache(Estimator):
             shapes = wp.empty(len(places), dtype=light_cache_native.LightShape, device=device)
             frame.launch(light_cache.shape_lights, [frame.data, state.luminances, shapes], len(places))
             state = replace(state, places=places, shapes=shapes, emitters=emitters.emitters)
+        state = replace(state, rest=woken_by(frame, state.rest))
+        if state.rest.is_resting:
+            tree = LightHierarchy().preprocess(frame, state.tree)
+            return replace(state, tree=tree or state.tree)
         if moved.any() and self.adapts_exploration:  # the cached lights may be the wrong ones
             tables = launch.copied(state.tables, light_cache.CacheTables)
             least = min(max(self.exploration, MOVING_EXPLORATION), MOST_EXPLORATION)
@@ -150,6 +158,7 @@ class VisibilityLightCache(Estimator):
         else:
             table = AliasTable.build(self._table(scene, frame.camera, moved, state.places[:, :3])).on(device)
         frame.paths.use_lights(light_cache.CACHED_LIGHTS, cache, table)
+        wish_for_lesson(frame, state.rest)
         return state
 
     def _tables(self, leaves: int, device: wp.Device) -> light_cache.CacheTables:
@@ -189,9 +198,31 @@ class VisibilityLightCache(Estimator):
         frame.paths.want(self.term)
 
     def after(self, frame: Frame, state: CacheState | None) -> CacheState | None:
-        """Return caches that learnt from the samples of the frame, if any were kept."""
+        """Return caches that learnt from the samples of the frame, if any were kept, and whether they rest next."""
         lesson = frame.offered(Lesson)
-        return state if lesson is None else self.learn(lesson, state)
+        if state is None:
+            return None
+        if state.rest.is_resting:
+            state = replace(state, rest=state.rest.rested())
+            return state if lesson is None else self._taken_over(lesson, state)
+        if lesson is None:
+            return replace(state, rest=state.rest.skipped())
+        if self.rests:
+            gains = frame_gains(frame, lesson)
+            rest = state.rest.judged(gains.lights, gains.variance, CACHE_COST, frame.scene.is_animated)
+            state = replace(state, rest=rest)
+        return self.learn(lesson, state)
+
+    def _taken_over(self, lesson: Lesson, state: CacheState) -> CacheState:
+        """Return the caches as they were, by the leaves of the next frame's tree."""
+        leaves = lesson.octree.leaf_count
+        tables, known = self._tables(leaves, lesson.device), _lists(leaves, lesson.device)
+        for name in ("items", "rates", "chances"):
+            setattr(tables, name, getattr(state.tables, name))
+        known.entries, known.tries = state.known.entries, state.known.tries
+        inputs = [lesson.origins, state.known, state.tables, known, tables]
+        lesson.launch(light_cache_build.take_over_lights, inputs)
+        return replace(state, tables=tables, known=known)
 
     def learn(self, lesson: Lesson, state: CacheState | None) -> CacheState | None:
         """Return the caches of the next frame, made from the samples of this one."""
@@ -259,6 +290,8 @@ class CacheState:
     """LightShape [emitter]: lights of this frame as the cache weighs them; None before the first frame."""
     emitters: wp.array | None = field(default=None, metadata={"derived": True})
     """Emitter [emitter]: lights of the scene in this frame; None before the first frame."""
+    rest: Rest = field(default_factory=Rest)
+    """Whether frames use the caches."""
 
 
 def _lists(leaves: int, device: wp.Device) -> light_cache_build.LightLists:

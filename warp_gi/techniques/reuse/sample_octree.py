@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -13,6 +13,7 @@ from warp_gi import launch
 from warp_gi.errors import OptionError, check_whole
 from warp_gi.kernels import octree as octree_kernels
 from warp_gi.kernels import samples as sample_kernels
+from warp_gi.scene.baked import whole_scene
 from warp_gi.stateful import Service
 
 if TYPE_CHECKING:
@@ -82,17 +83,30 @@ class SampleOctree(Service):
         return OctreeState(cube, prefixes, levels, wp.zeros(8, dtype=wp.int32, device=device))
 
     def preprocess(self, frame: Frame, state: OctreeState) -> OctreeState:
-        """Let samplers find their region in the tree, and record samples for ``after``; the state stays as it is."""
+        """Let samplers find their region in the tree, record samples for ``after``, and tell when lights begin to move.
+
+        Regions are made only where a sampler of the frame uses them.
+        """
         frame.paths.use_regions(sample_kernels.SAMPLE_REGIONS, lambda paths: self._regions(frame, state, paths))
-        return state
+        if not frame.scene.is_animated or not frame.scene.emitter_count:
+            return state
+        placed = whole_scene(frame.scene).placed_emitters(frame.device)
+        places = np.concatenate([placed.corners.ravel(), placed.table["position"].ravel()]).astype(np.float64)
+        move = len(state.places) == len(places) and not np.array_equal(places, state.places)
+        frame.offer(Motion(begins=move and not state.moved))
+        return replace(state, places=places, moved=np.asarray(move))
 
     def _regions(self, frame: Frame, state: OctreeState, paths: PathRequest) -> sample_kernels.SampleRegions:
         """Return the tree, and empty buffers for samples, as path kernels read them."""
         with frame.stage(f"preprocess {self.name}"):
             regions = sample_kernels.SampleRegions()
             regions.octree, regions.moves = state.octree, int(frame.scene.is_animated)
-            vertices = min(paths.max_depth - 1, MOST_VERTICES)
-            regions.records = self.records(frame, vertices, state.spare.take())
+            wish = frame.offered(LessonWish)
+            if wish is None or wish.is_wanted:
+                vertices = min(paths.max_depth - 1, MOST_VERTICES)
+                regions.records = self.records(frame, vertices, state.spare.take())
+            else:
+                regions.records.stride = 1  # and no vertices
         return regions
 
     def after(self, frame: Frame, state: OctreeState) -> OctreeState:
@@ -100,6 +114,8 @@ class SampleOctree(Service):
         if frame.paths.regions.sampler is not sample_kernels.SAMPLE_REGIONS:
             return state
         records = frame.paths.regions.data.records
+        if not records.vertices:
+            return state
         lesson = self.learn(state, records, frame.device)
         frame.offer(lesson)
         lesson.octree.spare.give(records)
@@ -141,7 +157,7 @@ class SampleOctree(Service):
         cube.nodes = tree.nodes
         grouped = sample_kernels.LeafSamples()
         grouped.starts, grouped.counts, grouped.order = tree.starts, counts, slots
-        grown = OctreeState(cube, tree.prefixes, tree.levels, tree.counts)
+        grown = OctreeState(cube, tree.prefixes, tree.levels, tree.counts, state.places, state.moved)
         return Lesson(grown, tree, records, grouped, neighbours, origins, device)
 
     def _build(self, state: OctreeState, codes: wp.array, device: wp.Device) -> tuple[octree_kernels.OctreeNodes, int]:
@@ -208,6 +224,10 @@ class OctreeState:
     """int32 [node]: level of the node's cell; the root has 0."""
     counts: wp.array
     """int32 [8 * node + octant]: number of samples of the last frame in each child's cell."""
+    places: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """float64: corners and positions of lights in the last frame in metres, one after another, where things move."""
+    moved: np.ndarray = field(default_factory=lambda: np.zeros((), bool))
+    """bool: whether lights moved in the last frame."""
     spare: SpareRecords = field(default_factory=SpareRecords, metadata={"derived": True})
     """Buffers for the next frame's samples, if the last frame left any."""
 
@@ -215,6 +235,22 @@ class OctreeState:
     def leaf_count(self) -> int:
         """Number of places for leaves: eight a node, those of children that are inner nodes included."""
         return 8 * self.octree.nodes.shape[0]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What the service tells of lights, in scenes where things move."""
+
+    begins: bool
+    """Whether lights move in this frame that did not in the last one."""
+
+
+@dataclass(frozen=True)
+class LessonWish:
+    """What estimators offer in ``preprocess`` that need not learn from every frame."""
+
+    is_wanted: bool
+    """Whether one of them wants to learn from the frame. If not, none of its samples are kept."""
 
 
 @dataclass
