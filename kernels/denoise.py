@@ -21,8 +21,10 @@ LEAST_COSINE = wp.constant(wp.float32(0.85))  # between normals of one surface
 FOOTPRINTS = wp.constant(wp.float32(3.0))  # of a pixel, from a plane, within which a point is of the same surface
 BLOCK = wp.constant(8)  # pixels along a side of the blocks in which light is compared with what was
 LEAST_CHANGE = wp.constant(wp.float32(0.1))  # share of the light that is no change, however sure
-LONG = wp.constant(wp.float32(4.0))  # frames from which on an average knows its variance
-SMALLEST_DEVIATION = wp.constant(wp.float32(1.0e-6))  # W/m^2; below it luminances are equal
+SMALLEST_DEVIATION = wp.constant(wp.float32(1.0e-3))  # share of a luminance below which differences are none
+UNKNOWN = wp.constant(wp.float32(-1.0))  # Filtered: in place of a variance
+SMALLEST = wp.constant(wp.float32(1.0e-20))  # keeps quotients finite
+MOST_LIGHT = wp.constant(wp.float32(1.0e15))  # more, or what is no number, is no light
 LARGEST_EXPONENT = wp.constant(wp.float32(12.0))  # of a tap's weight: what is farther off counts nothing
 LEAST_WEIGHT = wp.constant(wp.float32(1.0e-2))  # of history: less is a neighbour's light, which a pixel hardly touches
 
@@ -60,10 +62,11 @@ class Signals:
     diffuse: wp.array(dtype=wp.vec3)  # incident
     glossy: wp.array(dtype=wp.vec3)  # divided by the specular colour
     moments: wp.array(dtype=wp.vec2)  # means of the squared luminance of both
-    length: wp.array(dtype=wp.float32)  # frames in the average; 0: none
+    length: wp.array(dtype=wp.vec2)  # frames of the pipeline's samples in both averages; 0: the light is not known
 
 
-# Light on its way through the filter over pixels, [height * width]: colour, and the variance of its luminance.
+# Light on its way through the filter over pixels, [height * width]: colour, and the variance of its luminance, below 0
+# where it is not known.
 @wp.struct
 class Filtered:
     diffuse: wp.array(dtype=wp.vec4)
@@ -81,8 +84,8 @@ class Changes:
 # Weighted sums over pixels of the frame before.
 @wp.struct
 class Gathered:
-    weight: wp.float32
-    length: wp.float32
+    weight: wp.vec2
+    length: wp.vec2
     diffuse: wp.vec3
     glossy: wp.vec3
     moments: wp.vec2
@@ -95,6 +98,8 @@ class DenoiseSettings:
     footprint: wp.float32  # width of a pixel at a distance of 1
     diffuse_frames: wp.float32  # most frames in an average
     glossy_frames: wp.float32
+    worth: wp.float32  # frames of the pipeline's samples that this frame is worth
+    settled: wp.float32  # frames from which on an average knows its variance
     lag: wp.float32  # deviations from which on light is another; 0: it is never
     step: wp.int32  # pixels between the taps of this level
     normal: wp.float32  # exponents of the weights
@@ -119,10 +124,29 @@ def glossy_scale(specular: wp.vec3) -> wp.vec3:
     return wp.max(specular, wp.vec3(LEAST_SPECULAR, LEAST_SPECULAR, LEAST_SPECULAR))
 
 
+# Light whose channels that a surface does not reflect, and that nobody knows, are the mean of the others. The fourth
+# component is 0 where no channel is known.
+@wp.func
+def known_light(light: wp.vec3, reflectance: wp.vec3) -> wp.vec4:
+    total = float(0.0)
+    count = float(0.0)
+    for k in range(3):
+        if reflectance[k] > LEAST_REFLECTANCE:
+            total += light[k]
+            count += 1.0
+    if count == 0.0 or not (wp.max(wp.abs(light)) < MOST_LIGHT):
+        return wp.vec4(0.0, 0.0, 0.0, 0.0)
+    r = wp.vec4(light[0], light[1], light[2], 1.0)
+    for k in range(3):
+        if reflectance[k] <= LEAST_REFLECTANCE:
+            r[k] = total / count
+    return r
+
+
 # Thread: a pixel. Light that no estimator separated is shared out by reflectance: it is taken to have come
 # in alike for both lobes, as much as their reflectances together need to give what left.
 @wp.kernel
-def separate_light(first: wp.int32, light: NoisyLight, guides: Guides, out: Signals):
+def separate_light(first: wp.int32, settings: DenoiseSettings, light: NoisyLight, guides: Guides, out: Signals):
     i = first + wp.tid()
     diffuse = guides.guide_diffuse[i]
     specular = guides.guide_specular[i]
@@ -134,12 +158,14 @@ def separate_light(first: wp.int32, light: NoisyLight, guides: Guides, out: Sign
         glossy = light.lobe_glossy[i]
         rest = rest - wp.cw_mul(diffuse, incident) - glossy
     shared = divided(rest, diffuse + specular, LEAST_REFLECTANCE)
-    out.diffuse[i] = incident + shared
-    out.glossy[i] = wp.cw_div(glossy + wp.cw_mul(specular, shared), glossy_scale(specular))
+    a = known_light(incident + shared, diffuse)
+    b = known_light(wp.cw_div(glossy + wp.cw_mul(specular, shared), glossy_scale(specular)), specular)
+    out.diffuse[i] = wp.vec3(a[0], a[1], a[2])
+    out.glossy[i] = wp.vec3(b[0], b[1], b[2])
     d = luminance(out.diffuse[i])
     g = luminance(out.glossy[i])
     out.moments[i] = wp.vec2(d * d, g * g)
-    out.length[i] = 1.0
+    out.length[i] = wp.vec2(a[3], b[3]) * settings.worth
 
 
 # Whether pixel (x, y) of the frame before saw the surface that pixel i sees now.
@@ -182,11 +208,15 @@ def gather_history(
         w = wp.max(across, 0.0) * wp.max(down, 0.0)
         if w > 0.0 and saw_surface(settings, now, before, i, px, py):
             j = py * settings.width + px
-            r.weight += w
-            r.length += w * history.length[j]
-            r.diffuse += w * history.diffuse[j]
-            r.glossy += w * history.glossy[j]
-            r.moments += w * history.moments[j]
+            length = history.length[j]
+            a = wp.where(length[0] > 0.0, w, 0.0)
+            b = wp.where(length[1] > 0.0, w, 0.0)
+            both = wp.vec2(a, b)
+            r.weight += both
+            r.length += wp.cw_mul(both, length)
+            r.diffuse += a * history.diffuse[j]
+            r.glossy += b * history.glossy[j]
+            r.moments += wp.cw_mul(both, history.moments[j])
     return r
 
 
@@ -202,14 +232,20 @@ def reproject(first: wp.int32, settings: DenoiseSettings, now: Guides, before: G
         x = wp.float32(i - row * settings.width) + now.guide_motion[i][0]
         y = wp.float32(row) + now.guide_motion[i][1]
         h = gather_history(settings, now, before, history, i, x, y, 1)
-        if h.weight < LEAST_WEIGHT:
+        if wp.max(h.weight[0], h.weight[1]) < LEAST_WEIGHT:
             h = gather_history(settings, now, before, history, i, x, y, 2)
-    out.length[i] = 0.0
-    if h.weight >= LEAST_WEIGHT:
-        out.diffuse[i] = h.diffuse / h.weight
-        out.glossy[i] = h.glossy / h.weight
-        out.moments[i] = h.moments / h.weight
-        out.length[i] = h.length / h.weight
+    length = wp.vec2(0.0, 0.0)
+    moments = wp.vec2(0.0, 0.0)
+    if h.weight[0] >= LEAST_WEIGHT:
+        out.diffuse[i] = h.diffuse / h.weight[0]
+        length[0] = h.length[0] / h.weight[0]
+        moments[0] = h.moments[0] / h.weight[0]
+    if h.weight[1] >= LEAST_WEIGHT:
+        out.glossy[i] = h.glossy / h.weight[1]
+        length[1] = h.length[1] / h.weight[1]
+        moments[1] = h.moments[1] / h.weight[1]
+    out.length[i] = length
+    out.moments[i] = moments
 
 
 # By how much a block's light has changed, from sums over its pixels of: the new light less the average before, the
@@ -236,14 +272,20 @@ def find_changes(first: wp.int32, settings: DenoiseSettings, noisy: Signals, his
         for x in range(x0, wp.min(x0 + BLOCK, settings.width)):
             i = y * settings.width + x
             length = history.length[i]
-            if length >= LONG:
+            fresh = noisy.length[i]
+            counts = wp.vec2(
+                wp.where(length[0] >= settings.settled and fresh[0] > 0.0, 1.0, 0.0),
+                wp.where(length[1] >= settings.settled and fresh[1] > 0.0, 1.0, 0.0),
+            )
+            if counts[0] + counts[1] > 0.0:
                 new = wp.vec2(luminance(noisy.diffuse[i]), luminance(noisy.glossy[i]))
                 old = wp.vec2(luminance(history.diffuse[i]), luminance(history.glossy[i]))
                 off = new - old
                 spread = wp.max(history.moments[i] - wp.cw_mul(old, old), wp.vec2(0.0, 0.0))
-                difference += off
-                variance += wp.max(wp.cw_mul(off, off), spread) + spread / length
-                light += wp.max(new, old)
+                spread_of_mean = wp.cw_div(spread, wp.max(length, wp.vec2(1.0, 1.0)))
+                difference += wp.cw_mul(counts, off)
+                variance += wp.cw_mul(counts, wp.max(wp.cw_mul(off, off), spread) + spread_of_mean)
+                light += wp.cw_mul(counts, wp.max(new, old))
     changes.diffuse[b] = change_of(difference[0], variance[0], light[0], settings.lag)
     changes.glossy[b] = change_of(difference[1], variance[1], light[1], settings.lag)
 
@@ -266,11 +308,10 @@ def change_at(
     return top * (1.0 - fv) + bottom * fv
 
 
-# Weight of a new frame where an average of so many frames is there: all weigh the same until there are `most`.
+# Frames of an average that are kept when a frame is added that is worth `new` of them; there are at most `most`.
 @wp.func
-def new_weight(length: wp.float32, most: wp.float32, change: wp.float32) -> wp.float32:
-    kept = wp.min(length, most - 1.0) * (1.0 - change)
-    return 1.0 / (kept + 1.0)
+def kept_frames(length: wp.float32, new: wp.float32, most: wp.float32, change: wp.float32) -> wp.float32:
+    return wp.min(length, wp.max(most - new, 0.0)) * (1.0 - change)
 
 
 # Thread: a pixel. Adds the new frame to the average; `out` is it, and may be the average before.
@@ -280,27 +321,39 @@ def add_frame(
 ):
     i = first + wp.tid()
     length = history.length[i]
-    if length <= 0.0:
-        out.diffuse[i] = noisy.diffuse[i]
-        out.glossy[i] = noisy.glossy[i]
-        out.moments[i] = noisy.moments[i]
-        out.length[i] = 1.0
-        return
+    fresh = noisy.length[i]
+    moments = history.moments[i]
     change = wp.vec2(0.0, 0.0)
-    if settings.lag > 0.0:
+    if settings.lag > 0.0 and length[0] + length[1] > 0.0:
         y = i / settings.width
         x = i - y * settings.width
         rows = changes.diffuse.shape[0] / changes.columns
         change[0] = change_at(changes.diffuse, changes.columns, rows, x, y)
         change[1] = change_at(changes.glossy, changes.columns, rows, x, y)
-    a = new_weight(length, settings.diffuse_frames, change[0])
-    b = new_weight(length, settings.glossy_frames, change[1])
-    out.diffuse[i] = history.diffuse[i] * (1.0 - a) + noisy.diffuse[i] * a
-    out.glossy[i] = history.glossy[i] * (1.0 - b) + noisy.glossy[i] * b
-    m = history.moments[i]
-    n = noisy.moments[i]
-    out.moments[i] = wp.vec2(m[0] * (1.0 - a) + n[0] * a, m[1] * (1.0 - b) + n[1] * b)
-    out.length[i] = wp.min(length * (1.0 - change[0]) + 1.0, settings.diffuse_frames)
+    if fresh[0] > 0.0:
+        kept = kept_frames(length[0], fresh[0], settings.diffuse_frames, change[0])
+        a = fresh[0] / (kept + fresh[0])
+        if a >= 1.0:
+            out.diffuse[i] = noisy.diffuse[i]
+        else:
+            out.diffuse[i] = history.diffuse[i] * (1.0 - a) + noisy.diffuse[i] * a
+        moments[0] = moments[0] * (1.0 - a) + noisy.moments[i][0] * a
+        length[0] = kept + fresh[0]
+    if fresh[1] > 0.0:
+        kept = kept_frames(length[1], fresh[1], settings.glossy_frames, change[1])
+        b = fresh[1] / (kept + fresh[1])
+        if b >= 1.0:
+            out.glossy[i] = noisy.glossy[i]
+        else:
+            out.glossy[i] = history.glossy[i] * (1.0 - b) + noisy.glossy[i] * b
+        moments[1] = moments[1] * (1.0 - b) + noisy.moments[i][1] * b
+        length[1] = kept + fresh[1]
+    if length[0] <= 0.0:
+        out.diffuse[i] = wp.vec3(0.0, 0.0, 0.0)
+    if length[1] <= 0.0:
+        out.glossy[i] = wp.vec3(0.0, 0.0, 0.0)
+    out.moments[i] = moments
+    out.length[i] = length
 
 
 # Whether pixel j sees the surface of pixel i.
@@ -312,6 +365,38 @@ def same_surface(settings: DenoiseSettings, guides: Guides, i: wp.int32, j: wp.i
         return False
     away = wp.dot(guides.guide_plane[i], guides.guide_position[j] - guides.guide_position[i])
     return wp.abs(away) < FOOTPRINTS * settings.footprint * guides.guide_distance[i]
+
+
+# Sums over pixels around one, of one lobe.
+@wp.struct
+class Spread:
+    count: wp.float32
+    luminance: wp.float32
+    square: wp.float32
+    variance: wp.float32  # of a frame, by moments
+
+
+@wp.func
+def add_spread(sums: Spread, light: wp.vec3, moment: wp.float32) -> Spread:
+    r = sums
+    l = luminance(light)
+    r.count = r.count + 1.0
+    r.luminance = r.luminance + l
+    r.square = r.square + l * l
+    r.variance = r.variance + wp.max(moment - l * l, 0.0)
+    return r
+
+
+# Luminance that tells lights apart, and the variance of the mean, of an average of so many frames.
+@wp.func
+def told_by(sums: Spread, settings: DenoiseSettings, length: wp.float32, own: wp.float32) -> wp.vec2:
+    if length <= 0.0:
+        return wp.vec2(0.0, UNKNOWN)
+    if length < settings.settled:
+        mean = sums.luminance / sums.count
+        spread = wp.max(sums.square / sums.count - mean * mean, 0.0)
+        return wp.vec2(mean, spread * wp.max(settings.settled / length, 1.0))
+    return wp.vec2(own, sums.variance / sums.count / wp.max(length - 1.0, 1.0))
 
 
 # Thread: a pixel. Writes the light with the variance of its mean, and the luminances by which the first level tells
@@ -329,34 +414,30 @@ def estimate_variance(
     i = first + wp.tid()
     d = average.diffuse[i]
     g = average.glossy[i]
-    mean = wp.vec2(luminance(d), luminance(g))
-    square = average.moments[i]
-    spread = wp.max(square - wp.cw_mul(mean, mean), wp.vec2(0.0, 0.0))
     length = average.length[i]
+    diffuse = Spread()
+    glossy = Spread()
     if guides.guide_object[i] > 0:
         y = i / settings.width
         x = i - y * settings.width
-        reach = wp.where(length < LONG, 3, 1)
-        count = float(0.0)
-        sums = wp.vec2(0.0, 0.0)
-        squares = wp.vec2(0.0, 0.0)
-        spreads = wp.vec2(0.0, 0.0)
+        reach = int(1)
+        for k in range(2):
+            if length[k] > 0.0 and length[k] < settings.settled:
+                reach = 3
         for ty in range(wp.max(y - reach, 0), wp.min(y + reach + 1, settings.height)):
             for tx in range(wp.max(x - reach, 0), wp.min(x + reach + 1, settings.width)):
                 j = ty * settings.width + tx
                 if same_surface(settings, guides, i, j):
-                    l = wp.vec2(luminance(average.diffuse[j]), luminance(average.glossy[j]))
-                    count += 1.0
-                    sums += l
-                    squares += wp.cw_mul(l, l)
-                    spreads += wp.max(average.moments[j] - wp.cw_mul(l, l), wp.vec2(0.0, 0.0))
-        spread = spreads / count / wp.max(length - 1.0, 1.0)
-        if length < LONG:
-            mean = sums / count
-            spread = wp.max(squares / count - wp.cw_mul(mean, mean), wp.vec2(0.0, 0.0)) * (LONG / length)
-    out.diffuse[i] = wp.vec4(d[0], d[1], d[2], spread[0])
-    out.glossy[i] = wp.vec4(g[0], g[1], g[2], spread[1])
-    tells[i] = mean
+                    known = average.length[j]
+                    if known[0] > 0.0:
+                        diffuse = add_spread(diffuse, average.diffuse[j], average.moments[j][0])
+                    if known[1] > 0.0:
+                        glossy = add_spread(glossy, average.glossy[j], average.moments[j][1])
+    by_diffuse = told_by(diffuse, settings, length[0], luminance(d))
+    by_glossy = told_by(glossy, settings, length[1], luminance(g))
+    out.diffuse[i] = wp.vec4(d[0], d[1], d[2], by_diffuse[1])
+    out.glossy[i] = wp.vec4(g[0], g[1], g[2], by_glossy[1])
+    tells[i] = wp.vec2(by_diffuse[0], by_glossy[0])
 
 
 # Luminances that tell lights apart: those handed over, or where there are none the light's own.
@@ -369,12 +450,12 @@ def telling(tells: wp.array(dtype=wp.vec2), light: Filtered, i: wp.int32) -> wp.
     return wp.vec2(luminance(wp.vec3(d[0], d[1], d[2])), luminance(wp.vec3(g[0], g[1], g[2])))
 
 
-# Mean variance of a pixel and of the taps around it that are of its object.
+# Mean variances of a pixel and of those around it that are of its object.
 @wp.func
 def variance_around(settings: DenoiseSettings, guides: Guides, light: Filtered, i: wp.int32) -> wp.vec2:
     y = i / settings.width
     x = i - y * settings.width
-    total = float(0.0)
+    totals = wp.vec2(0.0, 0.0)
     sums = wp.vec2(0.0, 0.0)
     for row in range(-1, 2):
         for column in range(-1, 2):
@@ -384,9 +465,11 @@ def variance_around(settings: DenoiseSettings, guides: Guides, light: Filtered, 
             if ty >= 0 and ty < settings.height and tx >= 0 and tx < settings.width:
                 if guides.guide_object[j] == guides.guide_object[i]:
                     w = 1.0 / wp.float32(1 + row * row) / wp.float32(1 + column * column)
-                    total += w
-                    sums += w * wp.vec2(light.diffuse[j][3], light.glossy[j][3])
-    return sums / total
+                    both = wp.vec2(light.diffuse[j][3], light.glossy[j][3])
+                    known = wp.vec2(wp.where(both[0] >= 0.0, w, 0.0), wp.where(both[1] >= 0.0, w, 0.0))
+                    totals += known
+                    sums += wp.cw_mul(known, both)
+    return wp.cw_div(sums, wp.max(totals, wp.vec2(LEAST_REFLECTANCE, LEAST_REFLECTANCE)))
 
 
 # Light times a weight; its variance by the square of it.
@@ -415,8 +498,8 @@ def filter_level(
     x = i - y * settings.width
     variance = variance_around(settings, guides, light, i)
     mine = telling(tells, light, i)
-    by_diffuse = 1.0 / (settings.luminance * wp.sqrt(variance[0]) + SMALLEST_DEVIATION)
-    by_glossy = 1.0 / (settings.luminance * wp.sqrt(variance[1]) + SMALLEST_DEVIATION)
+    by_diffuse = 1.0 / (settings.luminance * wp.sqrt(variance[0]) + SMALLEST_DEVIATION * mine[0] + SMALLEST)
+    by_glossy = 1.0 / (settings.luminance * wp.sqrt(variance[1]) + SMALLEST_DEVIATION * mine[1] + SMALLEST)
     by_plane = 1.0 / (settings.plane * settings.footprint * guides.guide_distance[i])
     d = light.diffuse[i]
     g = light.glossy[i]
@@ -436,16 +519,20 @@ def filter_level(
                 if e < LARGEST_EXPONENT:
                     other = telling(tells, light, j)
                     w = 1.0 / wp.float32((1 + row * row) * (1 + column * column))
-                    if settings.filters_diffuse != 0:
+                    if settings.filters_diffuse != 0 and d[3] >= 0.0 and light.diffuse[j][3] >= 0.0:
                         a = w * wp.exp(-e - wp.abs(other[0] - mine[0]) * by_diffuse)
                         d = d + tap(light.diffuse[j], a)
                         d_total += a
-                    if settings.filters_glossy != 0:
+                    if settings.filters_glossy != 0 and g[3] >= 0.0 and light.glossy[j][3] >= 0.0:
                         b = w * wp.exp(-e - wp.abs(other[1] - mine[1]) * by_glossy)
                         g = g + tap(light.glossy[j], b)
                         g_total += b
-    out.diffuse[i] = tap(d, 1.0 / d_total)
-    out.glossy[i] = tap(g, 1.0 / g_total)
+    out.diffuse[i] = d
+    out.glossy[i] = g
+    if d[3] >= 0.0:
+        out.diffuse[i] = tap(d, 1.0 / d_total)
+    if g[3] >= 0.0:
+        out.glossy[i] = tap(g, 1.0 / g_total)
 
 
 # Thread: a pixel. Puts the filtered light back on its surface. What was not filtered stays as it was.

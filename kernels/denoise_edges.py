@@ -41,7 +41,7 @@ class EdgeSettings:
 class SharedLight:
     diffuse: wp.vec3
     glossy: wp.vec3
-    known: wp.bool
+    seen: wp.bool  # whether a pixel around sees a surface
 
 
 # Whether pixel j shows something else than pixel i: another surface, or another colour.
@@ -95,9 +95,11 @@ def shared_light(
     r = SharedLight()
     normal = shading_normal(s)
     by_plane = 1.0 / wp.max(settings.footprint * distance, SMALLEST_DISTANCE)
-    total = float(0.0)
-    likeliest = int(-1)
-    least = float(wp.inf)
+    totals = wp.vec2(0.0, 0.0)
+    diffuse_at = int(-1)
+    glossy_at = int(-1)
+    diffuse_away = float(wp.inf)
+    glossy_away = float(wp.inf)
     x0 = wp.int32(wp.floor(px)) - 1
     y0 = wp.int32(wp.floor(py)) - 1
     for k in range(9):
@@ -111,19 +113,27 @@ def shared_light(
                 across = wp.max(1.0 - wp.abs(px - wp.float32(x) - 0.5), 0.0)
                 down = wp.max(1.0 - wp.abs(py - wp.float32(y) - 0.5), 0.0)
                 w = (across * down + BASE_WEIGHT) * wp.exp(-away - NORMAL_WEIGHT * turned)
-                total += w
-                r.diffuse += w * color(light.diffuse[j])
-                r.glossy += w * color(light.glossy[j])
-                if away < least:
-                    least = away
-                    likeliest = j
-    r.known = likeliest >= 0
-    if r.known and total < LEAST_LIGHT:
-        r.diffuse = color(light.diffuse[likeliest])
-        r.glossy = color(light.glossy[likeliest])
-    elif r.known:
-        r.diffuse = r.diffuse / total
-        r.glossy = r.glossy / total
+                r.seen = True
+                if light.diffuse[j][3] >= 0.0:
+                    totals[0] = totals[0] + w
+                    r.diffuse += w * color(light.diffuse[j])
+                    if away < diffuse_away:
+                        diffuse_away = away
+                        diffuse_at = j
+                if light.glossy[j][3] >= 0.0:
+                    totals[1] = totals[1] + w
+                    r.glossy += w * color(light.glossy[j])
+                    if away < glossy_away:
+                        glossy_away = away
+                        glossy_at = j
+    if totals[0] >= LEAST_LIGHT:
+        r.diffuse = r.diffuse / totals[0]
+    elif diffuse_at >= 0:
+        r.diffuse = color(light.diffuse[diffuse_at])
+    if totals[1] >= LEAST_LIGHT:
+        r.glossy = r.glossy / totals[1]
+    elif glossy_at >= 0:
+        r.glossy = color(light.glossy[glossy_at])
     return r
 
 
@@ -160,7 +170,7 @@ def sample_edges(
         else:
             s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
             known = shared_light(settings, guides, light, s, hit.t, px, py)
-            if known.known:
+            if known.seen:
                 lit = wp.cw_mul(s.bsdf.diffuse, known.diffuse)
                 lit += wp.cw_mul(glossy_scale(average_specular(s.bsdf)), known.glossy)
                 total += lit + surface_emission(scene, hit.face, hit.u, hit.v, -direction)

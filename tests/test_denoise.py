@@ -16,7 +16,7 @@ from warp_gi.kernels import denoise, denoise_edges
 
 CPU = wp.get_device("cpu")
 W, H = 15, 11
-NO_BLUR = {"levels": 0, "glossy_levels": 0, "edge_samples": 0}
+NO_BLUR = {"levels": 0, "glossy_levels": 0, "edge_samples": 0, "first_samples": 1}
 NO_EDGES = SpatioTemporal(edge_samples=0, first_samples=1)
 
 
@@ -57,6 +57,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 def settings_of(**changes):
     settings = denoise.DenoiseSettings()
     values = {"width": W, "height": H, "footprint": 0.01, "diffuse_frames": 32, "glossy_frames": 16, "lag": 3.0}
+    values |= {"worth": 1.0, "settled": 4.0}
     values |= {"step": 1, "normal": 32.0, "plane": 1.0, "luminance": 2.0, "filters_diffuse": 1, "filters_glossy": 1}
     for name, value in (values | changes).items():
         setattr(settings, name, value)
@@ -127,7 +128,8 @@ def test_a_level_of_the_filter_is_the_formula(step, told):
                     e = 0.0
                 if e < 12:
                     off = abs(tells[ty, tx, kind] - tells[y, x, kind])
-                    w = 0.5 ** (abs(r) + abs(c)) * np.exp(-e - off / (2 * np.sqrt(variance) + 1e-6))
+                    deviation = 2 * np.sqrt(variance) + 1e-3 * tells[y, x, kind]
+                    w = 0.5 ** (abs(r) + abs(c)) * np.exp(-e - off / deviation)
                     total, color = total + w, color + w * light[ty, tx, :3]
                     spread += w**2 * light[ty, tx, 3]
             expected[y, x] = [*(color / total), spread / total**2]
@@ -141,6 +143,8 @@ def test_variance_is_of_the_mean():
     guides, light = random_guides(rng), rng.random((2, H, W, 3)).astype(np.float32)
     guides["guide_plane"] = guides["guide_normal"]
     moments, length = rng.uniform(1.0, 2.0, (H, W, 2)).astype(np.float32), rng.integers(1, 9, (H, W))
+    length = np.stack([length, rng.permuted(length, axis=0)], -1)
+    length[3:6, 4:7] = 0  # not known
     average = filled(
         denoise.Signals, diffuse=light[0], glossy=light[1], moments=moments, length=length.astype(np.float32)
     )
@@ -156,13 +160,17 @@ def test_variance_is_of_the_mean():
         found, luminance = image(result, H, W), light[kind].astype(float) @ LUMINANCE
         np.testing.assert_array_equal(found[..., :3], light[kind])
         for y, x in np.argwhere(guides["guide_object"] > 0):
-            n = length[y, x]
-            reach = 3 if n < 4 else 1
+            n = length[y, x, kind]
+            if n == 0:
+                assert found[y, x, 3] < 0
+                continue
+            reach = 3 if min(m if m else 4 for m in length[y, x]) < 4 else 1
             around = [
                 (ty, tx)
                 for ty in range(max(y - reach, 0), min(y + reach + 1, H))
                 for tx in range(max(x - reach, 0), min(x + reach + 1, W))
                 if guides["guide_object"][ty, tx]
+                and length[ty, tx, kind]
                 and normal[y, x] @ normal[ty, tx] >= 0.85
                 and abs(normal[y, x] @ (position[ty, tx] - position[y, x])) < 0.015 * guides["guide_distance"][y, x]
             ]
@@ -217,9 +225,9 @@ def test_separated_light_put_back_is_the_light(lobes):
         terms["indirect"] = terms["indirect"] * reflected
     terms["environment"], terms["emitters"] = 2 * reflected, terms["emitters"] * reflected
     light = filled(denoise.NoisyLight, noisy=sum(terms[n] for n in list(terms)[:4]), **terms)
-    moments, length = np.ones((H, W, 2), np.float32), np.ones((H, W), np.float32)
+    moments, length = np.ones((H, W, 2), np.float32), np.ones((H, W, 2), np.float32)
     signals = filled(denoise.Signals, diffuse=color(), glossy=color(), moments=moments, length=length)
-    launch.launch(denoise.separate_light, W * H, [light, guides, signals], CPU)
+    launch.launch(denoise.separate_light, W * H, [settings_of(), light, guides, signals], CPU)
     both = {name: image(getattr(signals, name), H, W) for name in ("diffuse", "glossy")}
     squares = np.stack([(values.astype(float) @ LUMINANCE) ** 2 for values in both.values()], -1)
     np.testing.assert_allclose(image(signals.moments, H, W), squares, rtol=1e-4)
@@ -233,9 +241,11 @@ def test_separated_light_put_back_is_the_light(lobes):
             **{n: np.zeros((H, W, 3), np.float32) for n in ("emission", "emitters", "indirect", "noisy")},
             environment=2 * reflected,
         )
-        launch.launch(denoise.separate_light, W * H, [flat, guides, signals], CPU)
-        incident = image(signals.diffuse, H, W)[reflected > 1e-6]
-        assert np.allclose(incident, 2, rtol=1e-5)
+        launch.launch(denoise.separate_light, W * H, [settings_of(), flat, guides, signals], CPU)
+        incident, known = image(signals.diffuse, H, W), image(signals.length, H, W) > 0
+        np.testing.assert_allclose(incident[diffuse.max(-1) > 1e-6], 2, rtol=1e-5)
+        np.testing.assert_array_equal(known[..., 0], diffuse.max(-1) > 1e-6)
+        np.testing.assert_array_equal(known[..., 1], specular.max(-1) > 1e-6)
 
 
 SIZE = (32, 24)
@@ -268,7 +278,7 @@ def sideways(step=0.3):
 
 
 def lengths(scheduler):
-    return scheduler.state("denoise").average.length.numpy().reshape(SIZE[::-1])
+    return scheduler.state("denoise").average.length.numpy()[:, 0].reshape(SIZE[::-1])
 
 
 def test_textures_under_even_light_are_not_blurred():
@@ -336,7 +346,7 @@ def test_no_history_from_other_objects(moves):
 
 def test_cuts_start_anew():
     shot = scene()
-    scheduler = gi.FrameScheduler(shot, still(), gi.Pipeline(spp=1, denoise="spatiotemporal"))
+    scheduler = gi.FrameScheduler(shot, still(), gi.Pipeline(spp=1, denoise=NO_EDGES))
 
     def longest(index, previous=None):
         scheduler.frame(index, previous)
@@ -350,7 +360,42 @@ def test_cuts_start_anew():
     assert [longest(16), longest(17)] == [1, 2]
     scheduler.camera = scheduler.camera.at_resolution(20, 12)
     scheduler.frame(18)
-    assert set(scheduler.state("denoise").average.length.numpy()) == {1}
+    assert set(scheduler.state("denoise").average.length.numpy()[:, 0]) == {1}
+
+
+def test_light_beside_black_is_not_lost():
+    """A plane in even light with tiles that are black, or black in a channel: light there is not known, and not 0."""
+    for dark in ((0.0, 0.0, 0.0), (0.8, 0.0, 0.0)):
+        pixels = np.full((8, 8, 4), 255, np.uint8)
+        pixels[:, ::2, :3] = np.array(dark) * 255
+        tiles = gi.Material("tiles", (0.8, 0.8, 0.8), base_color_texture=gi.Texture("tiles", pixels), specular=0.0)
+        plane = gi.Scene([gi.Node("wall", [card(-2.0, 9.0, tiles)])], environment=(0.5, 0.4, 0.3))
+        scheduler = gi.FrameScheduler(plane, sideways(), gi.Pipeline(spp=1, indirect=None, denoise="spatiotemporal"))
+        for index in range(3):
+            frame = scheduler.frame(index)
+            beauty, noisy = (frame.numpy(name).mean(axis=(0, 1)) for name in ("beauty", "noisy"))
+            np.testing.assert_allclose(beauty, noisy, rtol=0.06)
+
+
+def test_what_is_no_number_stays_where_it_is():
+    """A sample that is infinite is no light, in its frame and in those after."""
+    scheduler = gi.FrameScheduler(scene(), still(), gi.Pipeline(spp=1, indirect=Broken(), denoise="spatiotemporal"))
+    for index in range(4):
+        beauty = scheduler.frame(index).numpy("beauty")
+        assert np.isfinite(beauty).all() and beauty.max() < 100
+
+
+@dataclass(frozen=True)
+class Broken(gi.BsdfPaths):
+    """Indirect light that is infinite, no number, and very bright in a pixel each of frame 1."""
+
+    def trace(self, frame, state):
+        """Ask for paths, and add these to the term."""
+        super().trace(frame, state)
+        if frame.index == 1:
+            values = frame["indirect"].numpy()
+            values[[330, 400, 460]] = [[np.inf], [np.nan], [1e20]]
+            frame["indirect"].assign(values)
 
 
 @pytest.mark.parametrize("factor", [0.1, 4.0])
@@ -381,8 +426,9 @@ def test_still_light_is_not_forgotten():
     for index in range(24):
         scheduler.frame(index)
     state = scheduler.state("denoise")
-    length = state.average.length.numpy()[state.guides.guide_object.numpy() > 0]
-    assert np.median(length) == 24 and length.mean() > 23
+    length = state.average.length.numpy()[state.guides.guide_object.numpy() > 0, 0]
+    length = length[length > 0]  # the lamp reflects nothing
+    assert np.median(length) == 27 and length.mean() > 26
 
 
 def test_a_frame_without_a_frame_before_takes_more_samples():
@@ -421,6 +467,17 @@ def test_camera_samples_at_edges_are_what_many_would_show():
         frame = next(gi.render(shot, camera, gi.Pipeline(spp=1, indirect=None, denoise=denoiser)))
         errors[samples] = gi.metrics.rmse(frame.numpy("beauty"), wanted)
     assert errors[4] < 0.6 * errors[0] and errors[16] < 0.4 * errors[0], errors
+
+
+def test_frames_of_many_camera_samples_have_smooth_edges():
+    """A pixel of 16 camera samples keeps them: four would be noisier."""
+    camera = gi.Camera.look_at((0.03, 0.02, 3.5), (0, 0, 0), up=(0.2, 1, 0), hfov=60, resolution=SIZE)
+    beauty = {}
+    for samples in (0, 4):
+        denoiser = SpatioTemporal(edge_samples=samples)
+        frame = next(gi.render(scene(), camera, gi.Pipeline(spp=16, camera_samples=16, denoise=denoiser)))
+        beauty[samples] = frame.numpy("beauty")
+    np.testing.assert_array_equal(beauty[0], beauty[4])
 
 
 def test_edges_show_the_sky_and_what_emits():
@@ -475,6 +532,14 @@ def test_the_last_picture_is_limited_to_what_is_around():
         near = picture[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2].reshape(-1, 3)
         expected = 0.25 * picture[y, x] + 0.75 * (near.mean(0) + 1.5 * near.std(0))
         np.testing.assert_allclose(result[y, x], expected, rtol=1e-3)
+
+
+def test_a_picture_that_is_written_to_is_not_that_which_is_averaged():
+    scheduler = gi.FrameScheduler(scene(), still(), gi.Pipeline(spp=1, denoise=SpatioTemporal(blend=0.25)))
+    other = gi.FrameScheduler(scene(), still(), gi.Pipeline(spp=1, denoise=SpatioTemporal(blend=0.25)))
+    scheduler.frame(0)["beauty"].fill_(9.0)
+    other.frame(0)
+    np.testing.assert_array_equal(scheduler.frame(1).numpy("beauty"), other.frame(1).numpy("beauty"))
 
 
 def test_an_average_of_pictures_flickers_less():

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 __all__ = ["DENOISERS", "Denoiser", "Oidn", "SpatioTemporal"]
 
 MOST_LEVELS = 8
+LONG = 4.0
+"""Frames from which on an average knows its variance, if the first one has as many samples as others."""
 CLIP = 1.5
 """Standard deviations of the pixels around a pixel, to which the last picture is limited in it."""
 QUALITIES = ("high", "balanced", "fast")
@@ -70,8 +72,8 @@ class History:
     """Geometry and colours of the surfaces in the frame's pixels."""
     average: denoise.Signals
     """Averages over frames of diffuse and glossy light, and the number of frames in them."""
-    picture: wp.array
-    """The frame's beauty, vec3 [height * width]."""
+    picture: wp.array | None
+    """The frame's beauty, vec3 [height * width], if pictures are averaged."""
 
     def leads_to(self, frame: Frame) -> bool:
         """Return whether the frame's motion is towards the last frame, of the same scene and size."""
@@ -128,7 +130,7 @@ class SpatioTemporal(Denoiser):
     There is no average yet that would make up for few."""
     edge_samples: int = 4
     """Camera samples of a pixel whose neighbours show something else, 0 to 64. They share the light of the pixels
-    around, and cost no light samples. 0 takes none."""
+    around, and cost no light samples. 0 takes none, and so do frames with as many camera samples in each pixel."""
     blend: float = 1.0
     """Weight of a frame in the average of pictures, above 0 to 1 (temporal antialiasing): 0.25 flickers less and is
     softer; 1 is no average."""
@@ -158,7 +160,7 @@ class SpatioTemporal(Denoiser):
         """Fill ``frame["beauty"]``; the state is the last frame's History."""
         light, guides = frame.struct(denoise.NoisyLight), frame.struct(denoise.Guides)
         settings, average = self._settings(frame), self._signals(frame)
-        frame.launch(denoise.separate_light, [light, guides, average])
+        frame.launch(denoise.separate_light, [settings, light, guides, average])
         has_history = state is not None and state.leads_to(frame)
         if state is not None and has_history:
             average = self._accumulated(frame, settings, state, guides, average)
@@ -168,12 +170,13 @@ class SpatioTemporal(Denoiser):
         if edges.samples > 0:
             inputs = [frame.data, frame.camera_data, settings, edges, guides, filtered, frame["beauty"]]
             frame.launch_tiled(denoise_edges.sample_edges, inputs)
-        if state is not None and has_history and self.blend < 1:
+        if state is not None and has_history and state.picture is not None:
             picture = wp.clone(frame["beauty"])
             inputs = [settings, edges, frame["depth"], frame["motion"], picture, state.picture, frame["beauty"]]
             frame.launch(denoise_edges.average_pictures, inputs)
         scene = (frame.scene, light_of(frame.scene))
-        return History(frame.index, frame.camera.resolution, scene, guides, average, frame["beauty"])
+        kept = wp.clone(frame["beauty"]) if self.blend < 1 else None  # whoever has the frame may write to it
+        return History(frame.index, frame.camera.resolution, scene, guides, average, kept)
 
     def _accumulated(
         self,
@@ -225,13 +228,16 @@ class SpatioTemporal(Denoiser):
         settings.width, settings.height = frame.camera.resolution
         settings.footprint = 2.0 * math.tan(math.radians(frame.camera.hfov) / 2) / settings.width
         settings.diffuse_frames, settings.glossy_frames = self.frames, self.glossy_frames
+        settings.worth = frame.settings.spp / frame.pipeline_samples
+        settings.settled = LONG - 1.0 + max(1.0, self.first_samples / frame.pipeline_samples)
         settings.lag, settings.luminance = self.lag, self.luminance
         settings.normal, settings.plane = self.normal_power, self.plane_distance
         return settings
 
     def _edges(self, frame: Frame) -> denoise_edges.EdgeSettings:
         edges = denoise_edges.EdgeSettings()
-        edges.samples = self.edge_samples if frame.has_camera_rays else 0
+        few = frame.settings.camera_samples < self.edge_samples
+        edges.samples = self.edge_samples if frame.has_camera_rays and few else 0
         edges.seed, edges.tent = frame.seed, int(frame.settings.filter == "tent")
         edges.weight, edges.clip = self.blend, CLIP
         return edges
@@ -243,7 +249,7 @@ class SpatioTemporal(Denoiser):
         signals.diffuse = wp.empty(width * height, dtype=wp.vec3, device=frame.device)
         signals.glossy = wp.empty_like(signals.diffuse)
         signals.moments = wp.empty(width * height, dtype=wp.vec2, device=frame.device)
-        signals.length = wp.empty(width * height, dtype=wp.float32, device=frame.device)
+        signals.length = wp.empty(width * height, dtype=wp.vec2, device=frame.device)
         return signals
 
 

@@ -91,6 +91,8 @@ class Frame:
         """Values by name that decide the pixels, beside camera and time."""
         self.paths = PathRequest(data.emitters)
         """Requests of estimators to the path tracer."""
+        self.pipeline_samples = settings.spp
+        """Samples a pixel that the pipeline asks for; a denoiser may have asked for more (``settings.spp``)."""
         self.has_camera_rays = False
         """Whether the primary traces camera rays through the scene, so that more of them see the same."""
         self.estimators: dict[str, object] = {}

@@ -47,7 +47,7 @@ class LightHierarchy(Estimator):
         self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0
     ) -> TreeState | None:
         """Return the tree over the lights at time 0; None where they are picked by power."""
-        if not _has_choice(scene):
+        if not has_choice(scene):
             return None
         return first_tree(scene, launch.get_device(device))
 
@@ -81,7 +81,7 @@ class TreeState:
     """Tree as kernels read it."""
 
 
-def _has_choice(scene: Scene | BakedScene) -> bool:
+def has_choice(scene: Scene | BakedScene) -> bool:
     """Whether a scene has more than one lamp, so that different ones light points, and no more than a tree holds."""
     if not 0 < scene.emitter_count <= MOST_EMITTERS:
         return False

@@ -15,7 +15,13 @@ from warp_gi.estimator import Estimator
 from warp_gi.kernels import light_cache, light_cache_build, light_cache_native
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.emitters import PlacedEmitters
-from warp_gi.techniques.light_hierarchy.estimator import LightHierarchy, TreeState, first_tree, moved_tree
+from warp_gi.techniques.light_hierarchy.estimator import (
+    LightHierarchy,
+    TreeState,
+    first_tree,
+    has_choice,
+    moved_tree,
+)
 from warp_gi.techniques.reuse.rest import CACHE_COST, Rest, frame_gains, wish_for_lesson, woken_by
 from warp_gi.techniques.reuse.sample_octree import Lesson, SampleOctree, running_sums
 from warp_gi.techniques.shared.ltc import ltc_table
@@ -140,7 +146,7 @@ class VisibilityLightCache(Estimator):
             state = replace(state, places=places, shapes=shapes, emitters=emitters.emitters)
         state = replace(state, rest=woken_by(frame, state.rest))
         if state.rest.is_resting:
-            tree = LightHierarchy().preprocess(frame, state.tree)
+            tree = LightHierarchy().preprocess(frame, state.tree if has_choice(scene) else None)
             return replace(state, tree=tree or state.tree)
         if moved.any() and self.adapts_exploration:  # the cached lights may be the wrong ones
             tables = launch.copied(state.tables, light_cache.CacheTables)

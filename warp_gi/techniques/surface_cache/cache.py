@@ -19,7 +19,7 @@ from warp_gi.scene.baked import whole_scene
 from warp_gi.stateful import Ahead
 from warp_gi.techniques.shared.views import camera_rows, cameras_of
 from warp_gi.techniques.surface_cache.cells import NOTHING, with_table
-from warp_gi.techniques.surface_cache.fill import FillSettings, camera_boxes, empty_grid, fill, grid_at
+from warp_gi.techniques.surface_cache.fill import FillSettings, camera_boxes, empty_grid, fill, grid_at, tell_over
 from warp_gi.techniques.surface_cache.state import CacheState, Refresh, followed, is_moving
 
 if TYPE_CHECKING:
@@ -128,13 +128,7 @@ class SurfaceCache(RadianceCache):
         if not is_moving(scene):
             sums, vertices = fill(scene, settings, grid, cameras, target, seed, progress)
         cells, over = sums.with_levels().most_sampled(settings.capacity)
-        if over:
-            warnings.warn(
-                f"the surface cache is full: it keeps {self.capacity:,} cells, and {over:,} with fewer samples "
-                "found no place; light is blurred over larger cells there, and may leak through walls: "
-                "raise capacity, cell or growth",
-                stacklevel=2,
-            )
+        tell_over(over, self.capacity)
         arrays = {
             "keys": cells.keys,
             "cells": cells.means(),

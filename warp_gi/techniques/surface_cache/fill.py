@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
@@ -15,6 +16,7 @@ from warp_gi.kernels import surface_cache_fill as kernels
 from warp_gi.kernels.gbuffer import CameraData
 from warp_gi.kernels.light_hierarchy import LightTree
 from warp_gi.kernels.surface_cache import LARGEST_COORDINATE, MOST_OBJECTS, ObjectGrid, SurfaceCells
+from warp_gi.scene.animation import world_matrices
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.pinhole import camera_data
 from warp_gi.scene.scene import Scene
@@ -40,6 +42,8 @@ SHARE_OF_DIAGONAL, LARGEST_SIDE = 0.01, 0.15
 cell must not reach through a wall."""
 SMALLEST_VOLUME = 1e-18
 """Smallest volume of a unit cube of an object's own space, m^3, whose placement is inverted."""
+LEAST_SCALE = 0.5
+"""Scale of an object over that at time 0 down to which, and up to the inverse of which, it has a grid of its own."""
 MOST_BOXES = 8
 """Largest number of pieces of the camera's path that have a box each."""
 
@@ -107,10 +111,26 @@ def fill_lights(scene: Scene, device: wp.Device) -> LightTree | None:
     return None if state is None else state.data
 
 
-def table_of(grid: SurfaceCells, sums: Sums, capacity: int, device: wp.Device) -> SurfaceCells:
-    """Return a grid whose table holds the smallest cells ``sums`` and the levels above them."""
-    known, _ = sums.with_levels().most_sampled(capacity)
+def table_of(grid: SurfaceCells, sums: Sums, capacity: int, device: wp.Device, tells: bool = False) -> SurfaceCells:
+    """Return a grid whose table holds the smallest cells ``sums`` and the levels above them.
+
+    Warns of cells without a place if ``tells``.
+    """
+    known, over = sums.with_levels().most_sampled(capacity)
+    if tells:
+        tell_over(over, capacity)
     return with_table(grid, known.keys, known.means(), device)
+
+
+def tell_over(over: int, capacity: int) -> None:
+    """Warn of cells that found no place, if there are any."""
+    if over:
+        warnings.warn(
+            f"the surface cache is full: it keeps {capacity:,} cells, and {over:,} with fewer samples "
+            "found no place; light is blurred over larger cells there, and may leak through walls: "
+            "raise capacity, cell or growth",
+            stacklevel=3,
+        )
 
 
 def add_pass(
@@ -175,15 +195,18 @@ def grid_at(low: np.ndarray, side: float, growth: float, boxes: np.ndarray, devi
 def object_grids(scene: Scene, time: float, device: wp.Device) -> wp.array:
     """Return the grids of a scene's objects in their pose at ``time`` [s], ObjectGrid [object]; none if nothing moves.
 
-    An object whose placement has no inverse, as of one that shrinks to nothing, takes the grid of all that is at rest.
+    An object that is far larger or smaller than at time 0 takes the grid of all that is at rest: in its own one cells
+    would be as much larger or smaller.
     """
     moving, objects = scene.moving_objects, len(scene.object_names)
     rows = np.zeros(objects if moving else 0, ObjectGrid.numpy_dtype())
+    rest, now = (world_matrices(scene.nodes, at) if moving else [] for at in (0.0, time))
     for number, index in moving.items():
-        rest, now = scene.world_from_node(index, 0.0), scene.world_from_node(index, time)
-        if min(abs(np.linalg.det(rest[:3, :3])), abs(np.linalg.det(now[:3, :3]))) > SMALLEST_VOLUME:
+        volume = abs(np.linalg.det(now[index][:3, :3]))
+        grown = abs(np.linalg.det(rest[index][:3, :3])) / volume if volume > SMALLEST_VOLUME else 0.0
+        if LEAST_SCALE**3 < grown < LEAST_SCALE**-3:
             rows[number]["number"] = 1 + number % int(MOST_OBJECTS)
-            rows[number]["rest_from_world"] = rest @ np.linalg.inv(now)
+            rows[number]["rest_from_world"] = rest[index] @ np.linalg.inv(now[index])
     return launch.on_device(rows, ObjectGrid, device)
 
 

@@ -29,7 +29,7 @@ from warp_gi.techniques.shared.atlas.densities import parse_texel_sets
 from warp_gi.techniques.shared.atlas.padding import padded
 from warp_gi.techniques.shared.atlas.texels import covered_texels
 from warp_gi.techniques.shared.lamps import lit_data
-from warp_gi.techniques.surface_cache.cache import SurfaceCache
+from warp_gi.techniques.surface_cache.cache import SurfaceCache, check_still
 
 SIDE = int(kernels.SIDE)
 """Places along a side of a texel at which its light is gathered."""
@@ -141,6 +141,7 @@ def bake_light_map(
     Raises OptionError where charts fail, SceneError for a scene that moves or has no surface, BakeError for a bake of
     another technique or scene.
     """
+    check_still(scene)
     bake.check(type(cache).__name__, cache.bake_key(scene), cache.bake_settings(scene))
     target, tell = launch.get_device(device), progress or (lambda share: None)
     cells = cache.start(scene, device, bake, seed).cells

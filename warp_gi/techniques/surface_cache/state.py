@@ -48,8 +48,8 @@ class CacheState:
     """Sums of the samples' weights, float64 [cell]."""
     frame: np.ndarray = field(default_factory=lambda: np.array([-1]))
     """Number of the frame that the cells are of, int64 [1]; -1 before the first one."""
-    tabled: int = field(default=-1, metadata={"derived": True})
-    """Number of the frame that the table of ``cells`` is of: another one in a state that was loaded from a file."""
+    tabled: np.ndarray | None = field(default=None, metadata={"derived": True})
+    """The array ``keys`` that the table of ``cells`` is of: another one in a state that was loaded from a file."""
 
 
 @dataclass(frozen=True)
@@ -79,12 +79,14 @@ def followed(frame: Frame, state: CacheState, settings: FillSettings, refresh: R
     grid = launch.copied(state.cells, SurfaceCells)
     grid.objects = object_grids(scene, frame.time, device)
     last = int(state.frame[0])
+    if frame.index == last:
+        return state
     left = refresh.memory ** abs(frame.index - last) if last >= 0 else 0.0
     if left < LEAST_LEFT:
         sums, _ = fill(scene, settings, grid, [frame.camera], device, frame.seed)
     else:
         known = Sums(state.keys, state.light, state.weights)
-        if state.tabled == last:
+        if state.tabled is state.keys:
             cells = launch.copied(state.cells, SurfaceCells)
             cells.objects = grid.objects
         else:
@@ -100,16 +102,17 @@ def followed(frame: Frame, state: CacheState, settings: FillSettings, refresh: R
                 sums = valid + add_pass(
                     scene, settings, cells, [frame.camera], done, refresh.refresh, frame.seed, device, lights
                 )
-    cells = table_of(grid, sums, settings.capacity, device)
-    return CacheState(cells, True, sums.keys, sums.light, 1.0 * sums.counts, np.array([frame.index]), frame.index)
+    cells = table_of(grid, sums, settings.capacity, device, tells=last < 0)
+    return CacheState(cells, True, sums.keys, sums.light, 1.0 * sums.counts, np.array([frame.index]), sums.keys)
 
 
 def still_valid(old: Sums, new: Sums) -> Sums:
     """Return what was known before a frame, but for where the frame's samples say that the light is another.
 
     In every large cell each sample is compared with the mean of its own small cell, as the camera may look at other
-    parts of it now. Of n differences d around 0 the sum has a variance of about that of d times n, by the samples
-    themselves, and the error of the old means besides.
+    parts of it now. The sum of n differences d has n times the variance of d, by the samples themselves, or by the old
+    ones if those varied more: samples that all miss a rare light seem sure of its absence. The error of the old means
+    comes on top.
     """
     _, at, by = np.intersect1d(new.keys, old.keys, assume_unique=True, return_indices=True)
     if not len(at):
@@ -118,7 +121,8 @@ def still_valid(old: Sums, new: Sums) -> Sums:
     sums, mean = new.light[at, :3] @ LUMINANCE, old.light[by, :3] @ LUMINANCE / weight
     spread = np.maximum(old.light[by, 6] / weight - mean**2, 0.0) / weight
     difference = sums - count * mean
-    variance = np.maximum(new.light[at, 6] - 2 * mean * sums + count * mean**2, 0.0) + count**2 * spread
+    variance = np.maximum(new.light[at, 6] - 2 * mean * sums + count * mean**2, count * weight * spread)
+    variance = variance + count**2 * spread
     light = np.maximum(sums, count * mean)
     is_valid, around, every = np.ones(len(old.keys), bool), new.keys[at], old.keys
     for level in range(1, max(LEAST_CHANGE) + 1):
