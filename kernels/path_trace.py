@@ -120,6 +120,14 @@ class PathBuffers:
     moment2: wp.array(dtype=wp.vec3)  # of their squares
 
 
+# Adds the light of a path, parted by lobes: diffuse light as it comes in.
+@wp.func
+def add_lobes(buffers: PathBuffers, pixel: wp.int32, s: Surface, r: PathRadiance):
+    incident = divided(r.diffuse, s.bsdf.diffuse, LEAST_REFLECTANCE)
+    buffers.lobe_diffuse[pixel] = buffers.lobe_diffuse[pixel] + incident
+    buffers.lobe_glossy[pixel] = buffers.lobe_glossy[pixel] + r.glossy
+
+
 class PathTracer(NamedTuple):
     """What is made for one combination of samplers."""
 
@@ -453,8 +461,6 @@ def _made(
         indirect = wp.vec3(0.0, 0.0, 0.0)
         moment1 = wp.vec3(0.0, 0.0, 0.0)
         moment2 = wp.vec3(0.0, 0.0, 0.0)
-        diffuse = wp.vec3(0.0, 0.0, 0.0)
-        glossy = wp.vec3(0.0, 0.0, 0.0)
         first_index = pixel_sample_index(p[0], p[1], settings.first_sample, settings.sample_bits)
         for i in range(settings.sample_count):
             path = wp.int64(first + wp.tid()) * wp.int64(paths.spp) + wp.int64(settings.first_sample + i)
@@ -465,8 +471,8 @@ def _made(
             environment = environment + r.environment
             emitters = emitters + r.emitters
             indirect = indirect + r.indirect
-            diffuse = diffuse + r.diffuse
-            glossy = glossy + r.glossy
+            if paths.lobes != 0:
+                add_lobes(buffers, pixel, s, r)
             beauty = emission + r.environment + r.emitters + r.indirect
             moment1 = moment1 + beauty
             moment2 = moment2 + wp.cw_mul(beauty, beauty)
@@ -475,10 +481,6 @@ def _made(
         buffers.indirect[pixel] = buffers.indirect[pixel] + indirect
         buffers.moment1[pixel] = buffers.moment1[pixel] + moment1
         buffers.moment2[pixel] = buffers.moment2[pixel] + moment2
-        if paths.lobes != 0:
-            incident = divided(diffuse, s.bsdf.diffuse, LEAST_REFLECTANCE)
-            buffers.lobe_diffuse[pixel] = buffers.lobe_diffuse[pixel] + incident
-            buffers.lobe_glossy[pixel] = buffers.lobe_glossy[pixel] + glossy
 
     return PathTracer(Samplers, trace_path, trace_paths)
 

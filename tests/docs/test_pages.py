@@ -118,7 +118,7 @@ def test_the_example_of_the_readme_names_what_there_is():
     """It renders the atrium, which takes a minute; here two rooms, small."""
     (text,) = blocks(ROOT / "README.md", "python")
     assert len(text.splitlines()) <= 8
-    for long, short in (('"atrium"', '"two_rooms"'), ("spp=16", "spp=1"), ("range(8)", "range(1)")):
+    for long, short in (('"atrium"', '"two_rooms"'), ("range(8)", "range(1)")):
         assert long in text
         text = text.replace(long, short)
     assert '_path("two_rooms")' in text
