@@ -148,7 +148,7 @@ _PROBES = Region(
 
 _DENOISERS = Region(
     COLUMNS,
-    "**Denoisers** on a moving camera, 480x270, preset `path`, RMSE of the eighth frame:",
+    "**Denoisers** on a moving camera, 480x270, preset `path`, FLIP of the eighth frame against many camera samples:",
     (
         Grid(
             "scene, rays a pixel",
@@ -158,9 +158,9 @@ _DENOISERS = Region(
                 for rays in (1, 2, 8)
             },
             (
-                GridColumn("noisy", Figure("noisy RMSE")),
-                GridColumn("`spatiotemporal`", Figure("ST RMSE")),
-                GridColumn("`oidn`", Figure("OIDN RMSE")),
+                GridColumn("noisy", Figure("noisy FLIP")),
+                GridColumn("`spatiotemporal`", Figure("ST FLIP")),
+                GridColumn("`oidn`", Figure("OIDN FLIP")),
                 GridColumn("`spatiotemporal`, ms", Figure("ST ms")),
                 GridColumn("`oidn`, ms", Figure("OIDN ms")),
             ),
@@ -175,7 +175,7 @@ REGIONS = {"probes": _PROBES, "denoisers": _DENOISERS}
 def _gain(case: str) -> Figure:
     """Return how many times lower the denoiser makes the error of one ray a pixel."""
     only = {"case": case, "pipeline": "paths", "rays a pixel": 1}
-    return Figure("noisy RMSE", only, over="ST RMSE")
+    return Figure("noisy FLIP", only, over="ST FLIP")
 
 
 HEADLINES = (
@@ -197,12 +197,12 @@ HEADLINES = (
         "SpatioTemporal",
         "denoises over frames and neighbouring pixels",
         Text(
-            "one ray a pixel: RMSE {least} times lower in the atrium, {most} times in the Cornell box",
+            "one ray a pixel: FLIP {least} times lower in the atrium, {most} times in the Cornell box",
             {"least": _gain("atrium"), "most": _gain("cornell_box")},
             "denoise",
         ),
         "denoising",
         "denoising",
-        "McGuire et al. 2017",
+        "Schied et al. 2017",
     ),
 )
