@@ -125,7 +125,7 @@ def test_a_scene_has_rows_at_equal_samples_and_beside_its_reference(monkeypatch)
 def test_a_reference_takes_an_estimator_of_emitters():
     scene, camera = gi.builtin_scene("plates"), gi.builtin_scene("plates").cameras["main"].at_resolution(16, 9)
     power, hierarchy = (
-        computed(scene, camera, "cpu", 1, 64, emitters=emitters) for emitters in (None, gi.LightHierarchy())
+        computed(scene, camera, "cpu", 1, 64, emitters=emitters) for emitters in (gi.PowerLights(), None)
     )
     assert hierarchy.noise != power.noise
     assert hierarchy.picture.mean() == pytest.approx(power.picture.mean(), rel=0.1)
