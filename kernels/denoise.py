@@ -168,6 +168,19 @@ def separate_light(first: wp.int32, settings: DenoiseSettings, light: NoisyLight
     out.length[i] = wp.vec2(a[3], b[3]) * settings.worth
 
 
+# Whether pixel j of a frame sees the surface of pixel i of `now`, which is at `place` in that frame.
+@wp.func
+def same_surface(
+    settings: DenoiseSettings, now: Guides, i: wp.int32, place: wp.vec3, frame: Guides, j: wp.int32
+) -> wp.bool:
+    if frame.guide_object[j] != now.guide_object[i]:
+        return False
+    if wp.dot(now.guide_normal[i], frame.guide_normal[j]) < LEAST_COSINE:
+        return False
+    away = wp.dot(now.guide_plane[i], frame.guide_position[j] - place)
+    return wp.abs(away) < FOOTPRINTS * settings.footprint * now.guide_distance[i]
+
+
 # Whether pixel (x, y) of the frame before saw the surface that pixel i sees now.
 @wp.func
 def saw_surface(
@@ -175,13 +188,7 @@ def saw_surface(
 ) -> wp.bool:
     if x < 0 or y < 0 or x >= settings.width or y >= settings.height:
         return False
-    j = y * settings.width + x
-    if before.guide_object[j] != now.guide_object[i]:
-        return False
-    if wp.dot(now.guide_normal[i], before.guide_normal[j]) < LEAST_COSINE:
-        return False
-    away = wp.dot(now.guide_plane[i], before.guide_position[j] - now.guide_previous[i])
-    return wp.abs(away) < FOOTPRINTS * settings.footprint * now.guide_distance[i]
+    return same_surface(settings, now, i, now.guide_previous[i], before, y * settings.width + x)
 
 
 # Mean of the average before, over the pixels within `reach` of (x, y) that saw the surface of pixel i, by a
@@ -314,6 +321,14 @@ def kept_frames(length: wp.float32, new: wp.float32, most: wp.float32, change: w
     return wp.min(length, wp.max(most - new, 0.0)) * (1.0 - change)
 
 
+# An average with new light of a weight in it; of the weight 1 nothing is read of the average, which may not be there.
+@wp.func
+def with_new(average: wp.vec3, light: wp.vec3, weight: wp.float32) -> wp.vec3:
+    if weight >= 1.0:
+        return light
+    return average * (1.0 - weight) + light * weight
+
+
 # Thread: a pixel. Adds the new frame to the average; `out` is it, and may be the average before.
 @wp.kernel
 def add_frame(
@@ -333,19 +348,13 @@ def add_frame(
     if fresh[0] > 0.0:
         kept = kept_frames(length[0], fresh[0], settings.diffuse_frames, change[0])
         a = fresh[0] / (kept + fresh[0])
-        if a >= 1.0:
-            out.diffuse[i] = noisy.diffuse[i]
-        else:
-            out.diffuse[i] = history.diffuse[i] * (1.0 - a) + noisy.diffuse[i] * a
+        out.diffuse[i] = with_new(history.diffuse[i], noisy.diffuse[i], a)
         moments[0] = moments[0] * (1.0 - a) + noisy.moments[i][0] * a
         length[0] = kept + fresh[0]
     if fresh[1] > 0.0:
         kept = kept_frames(length[1], fresh[1], settings.glossy_frames, change[1])
         b = fresh[1] / (kept + fresh[1])
-        if b >= 1.0:
-            out.glossy[i] = noisy.glossy[i]
-        else:
-            out.glossy[i] = history.glossy[i] * (1.0 - b) + noisy.glossy[i] * b
+        out.glossy[i] = with_new(history.glossy[i], noisy.glossy[i], b)
         moments[1] = moments[1] * (1.0 - b) + noisy.moments[i][1] * b
         length[1] = kept + fresh[1]
     if length[0] <= 0.0:
@@ -354,17 +363,6 @@ def add_frame(
         out.glossy[i] = wp.vec3(0.0, 0.0, 0.0)
     out.moments[i] = moments
     out.length[i] = length
-
-
-# Whether pixel j sees the surface of pixel i.
-@wp.func
-def same_surface(settings: DenoiseSettings, guides: Guides, i: wp.int32, j: wp.int32) -> wp.bool:
-    if guides.guide_object[j] != guides.guide_object[i]:
-        return False
-    if wp.dot(guides.guide_normal[i], guides.guide_normal[j]) < LEAST_COSINE:
-        return False
-    away = wp.dot(guides.guide_plane[i], guides.guide_position[j] - guides.guide_position[i])
-    return wp.abs(away) < FOOTPRINTS * settings.footprint * guides.guide_distance[i]
 
 
 # Sums over pixels around one, of one lobe.
@@ -427,7 +425,7 @@ def estimate_variance(
         for ty in range(wp.max(y - reach, 0), wp.min(y + reach + 1, settings.height)):
             for tx in range(wp.max(x - reach, 0), wp.min(x + reach + 1, settings.width)):
                 j = ty * settings.width + tx
-                if same_surface(settings, guides, i, j):
+                if same_surface(settings, guides, i, guides.guide_position[i], guides, j):
                     known = average.length[j]
                     if known[0] > 0.0:
                         diffuse = add_spread(diffuse, average.diffuse[j], average.moments[j][0])
