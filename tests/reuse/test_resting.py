@@ -275,9 +275,7 @@ def test_the_variance_of_a_picture_is_that_of_its_pixels(monkeypatch):
     """On a floor of even light, of which pixels are independent: against the variance over seeds."""
     found = []
     ask = rest.frame_gains
-    for module in ("light_cache", "guided_paths"):
-        name = f"warp_gi.techniques.reuse.{module}.frame_gains"
-        monkeypatch.setattr(name, lambda frame, lesson: found.append(ask(frame, lesson)) or found[-1])
+    monkeypatch.setattr(rest, "frame_gains", lambda frame, lesson: found.append(ask(frame, lesson)) or found[-1])
     pictures = []
     for seed in range(24):
         frame = scheduler(seed=seed, spp=1).frame(0)
@@ -292,9 +290,7 @@ def test_gains_of_the_cache_are_those_of_pictures(monkeypatch):
     """What samples tell is by how much the hierarchy's pictures vary more, where lamps are seen through gaps."""
     found = []
     ask = rest.frame_gains
-    monkeypatch.setattr(
-        "warp_gi.techniques.reuse.light_cache.frame_gains", lambda *args: found.append(ask(*args)) or found[-1]
-    )
+    monkeypatch.setattr(rest, "frame_gains", lambda *args: found.append(ask(*args)) or found[-1])
     monkeypatch.setattr(Rest, "judged", lambda self, *args: self)
     view = gi.builtin_camera_path("warehouse").at_resolution(64, 36).camera(0)
     scene, variances = gi.builtin_scene("warehouse"), []

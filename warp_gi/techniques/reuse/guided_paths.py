@@ -11,7 +11,7 @@ from warp_gi import launch
 from warp_gi.errors import OptionError, check_whole
 from warp_gi.kernels import guided_directions, guided_shares, quadtree, quadtree_adapt
 from warp_gi.techniques.paths.estimators import BsdfPaths
-from warp_gi.techniques.reuse.rest import GUIDE_COST, Rest, frame_gains, wish_for_lesson, woken_by
+from warp_gi.techniques.reuse.rest import GUIDE_COST, Rest, rest_after, wish_for_lesson, woken_by
 from warp_gi.techniques.reuse.sample_octree import Lesson, SampleOctree
 
 if TYPE_CHECKING:
@@ -110,17 +110,12 @@ class GuidedPaths(BsdfPaths):
     def after(self, frame: Frame, state: GuideState) -> GuideState:
         """Return quadtrees that learnt from the samples of the frame, if any were kept, and whether they rest next."""
         lesson = frame.offered(Lesson)
-        if state.rest.is_resting:
-            state = replace(state, rest=state.rest.rested())
-            return (
-                state if lesson is None else self._counted(self._taken_over(lesson, state), lesson.device, state.rest)
-            )
+        was_resting = state.rest.is_resting
+        state = replace(state, rest=rest_after(frame, lesson, state.rest, self.rests, "directions", GUIDE_COST))
         if lesson is None:
-            return replace(state, rest=state.rest.skipped())
-        if self.rests:
-            gains = frame_gains(frame, lesson)
-            rest = state.rest.judged(gains.directions, gains.variance, GUIDE_COST, frame.scene.is_animated)
-            state = replace(state, rest=rest)
+            return state
+        if was_resting:
+            return self._counted(self._taken_over(lesson, state), lesson.device, state.rest)
         return self.learn(lesson, state)
 
     def learn(self, lesson: Lesson, state: GuideState) -> GuideState:

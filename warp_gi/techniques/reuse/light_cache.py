@@ -22,7 +22,7 @@ from warp_gi.techniques.light_hierarchy.estimator import (
     has_choice,
     moved_tree,
 )
-from warp_gi.techniques.reuse.rest import CACHE_COST, Rest, frame_gains, wish_for_lesson, woken_by
+from warp_gi.techniques.reuse.rest import CACHE_COST, Rest, rest_after, wish_for_lesson, woken_by
 from warp_gi.techniques.reuse.sample_octree import Lesson, SampleOctree, running_sums
 from warp_gi.techniques.shared.ltc import ltc_table
 
@@ -208,15 +208,12 @@ class VisibilityLightCache(Estimator):
         lesson = frame.offered(Lesson)
         if state is None:
             return None
-        if state.rest.is_resting:
-            state = replace(state, rest=state.rest.rested())
-            return state if lesson is None else self._taken_over(lesson, state)
+        was_resting = state.rest.is_resting
+        state = replace(state, rest=rest_after(frame, lesson, state.rest, self.rests, "lights", CACHE_COST))
         if lesson is None:
-            return replace(state, rest=state.rest.skipped())
-        if self.rests:
-            gains = frame_gains(frame, lesson)
-            rest = state.rest.judged(gains.lights, gains.variance, CACHE_COST, frame.scene.is_animated)
-            state = replace(state, rest=rest)
+            return state
+        if was_resting:
+            return self._taken_over(lesson, state)
         return self.learn(lesson, state)
 
     def _taken_over(self, lesson: Lesson, state: CacheState) -> CacheState:

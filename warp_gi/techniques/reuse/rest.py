@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import warp as wp
@@ -167,6 +167,23 @@ class Rest:
         """Return the rest of a saved state."""
         kinds = (type(getattr(self, one.name)) for one in fields(self))
         return Rest(*(kind(value) for kind, value in zip(kinds, arrays["numbers"], strict=True)))
+
+
+def rest_after(
+    frame: Frame, lesson: Lesson | None, rest: Rest, rests: bool, gain: Literal["lights", "directions"], cost: float
+) -> Rest:
+    """Return what follows a frame: ``lesson`` are its samples, if any were kept, and ``cost`` is that of ``judged``.
+
+    ``gain`` names the technique's in ``Gains``. One that never ``rests`` is not judged.
+    """
+    if rest.is_resting:
+        return rest.rested()
+    if lesson is None:
+        return rest.skipped()
+    if not rests:
+        return rest
+    gains = frame_gains(frame, lesson)
+    return rest.judged(getattr(gains, gain), gains.variance, cost, frame.scene.is_animated)
 
 
 def woken_by(frame: Frame, rest: Rest) -> Rest:
