@@ -22,6 +22,8 @@ from warp_gi.stateful import Ahead, Service, Stateful
 
 FILTERS = ("box", "tent")
 MOST_SAMPLES = 1 << 24  # a pixel; random numbers count samples and pixels together in 32 bits
+DEFAULT = "clean"
+"""Preset of who names no pipeline. ``Pipeline()``, the preset "path", is the reference."""
 DENOISER = "denoise"
 """Place of the denoiser among states."""
 

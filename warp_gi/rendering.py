@@ -6,9 +6,10 @@ from collections.abc import Callable, Container, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from warp_gi.baking import Bake
 from warp_gi.errors import OptionError
 from warp_gi.estimator import Estimator
-from warp_gi.pipeline import Pipeline
+from warp_gi.pipeline import DEFAULT, Pipeline
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.sky_motion import sky_start
 from warp_gi.scheduler import FrameScheduler
@@ -16,7 +17,6 @@ from warp_gi.sequence.resume import Output, Plan, SequenceRun, shots_of
 from warp_gi.stateful import Stateful
 
 if TYPE_CHECKING:
-    from warp_gi.baking import Bake
     from warp_gi.frame import Frame
     from warp_gi.scene.scene import Scene
 
@@ -52,7 +52,8 @@ def render(
     Args:
         scene: What is rendered; or a Bake that can be rendered without its scene, by the preset "probe_view".
         camera: A Camera (one frame) or a CameraPath.
-        pipeline: The estimators; None is the preset "path".
+        pipeline: The estimators; None is the preset "clean", and "probe_view" for a Bake. ``Pipeline()`` is the
+            reference, "path".
         frames: Frame numbers in order; None is every frame of the path.
         device: "cpu", "cuda", "cuda:1".
         seed: Every random number follows from it, the frame, the pixel and the sample.
@@ -74,7 +75,7 @@ def render(
     if output is None and (resume or preview or exposure or precision != "half"):
         raise OptionError('resume, precision, preview and exposure are of files; give output="out/shot.####.exr" too')
     wanted = _frame_numbers(camera, frames)
-    scheduler = FrameScheduler(scene, camera, pipeline or Pipeline(), device, seed, progress, bakes)
+    scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, progress, bakes)
     if output is None:
         for position, index in enumerate(wanted):
             if index not in skip:
@@ -115,7 +116,7 @@ def plan_sequence(
     the scene is left under the sky of the last frame.
     """
     wanted = _frame_numbers(camera, frames)
-    scheduler = FrameScheduler(scene, camera, pipeline or Pipeline(), device, seed, progress, bakes)
+    scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, progress, bakes)
     files = Output(Path(output), precision)
     shots = shots_of(camera, wanted, files.pattern)
     return SequenceRun(scheduler, shots, files).plan() if shots else Plan((), ())
@@ -164,6 +165,10 @@ def bake(
             f"{type(estimator).__name__} with these settings has nothing to bake; render with it as it is"
         )
     return result
+
+
+def _chosen(pipeline: Pipeline | None, scene: Scene | Bake) -> Pipeline:
+    return Pipeline.preset("probe_view" if isinstance(scene, Bake) else DEFAULT) if pipeline is None else pipeline
 
 
 def _frame_numbers(camera: Camera | CameraPath, frames: Iterable[int] | None) -> list[int]:

@@ -28,7 +28,7 @@ from warp_gi.cli.report import Reporter, run_command
 from warp_gi.errors import OptionError
 from warp_gi.files import check_writable
 from warp_gi.frame import Frame
-from warp_gi.pipeline import Pipeline
+from warp_gi.pipeline import DEFAULT, Pipeline
 from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.scene import Scene
@@ -62,7 +62,7 @@ class Render(SceneOptions):
 
     scene: Annotated[str, tyro.conf.Positional, flag("[SCENE]", f"{DEFAULT_SCENE}, with previews")] = ""
     """A GLB, glTF, OBJ or PLY file, the name of a built-in scene, or a bake of probes, .safetensors, to show alone."""
-    pipeline: Annotated[str, flag("NAME", "path; probe_view for a bake alone")] = ""
+    pipeline: Annotated[str, flag("NAME", f"{DEFAULT}; probe_view for a bake alone")] = ""
     """Preset, with estimators exchanged after commas: path,indirect=none. Its settings are the flags below."""
     denoise: Annotated[str, flag("NAME", "as the pipeline says: none")] = ""
     """Denoiser: none, oidn or spatiotemporal. Its settings are then flags below."""
@@ -99,7 +99,7 @@ class Render(SceneOptions):
     """Print nothing but errors."""
     verbose: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print a table of the time of each stage."""
-    settings: Annotated[Pipeline, tyro.conf.arg(name="")] = field(default_factory=Pipeline)
+    settings: Annotated[Pipeline, tyro.conf.arg(name="")] = field(default_factory=lambda: Pipeline.preset(DEFAULT))
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -111,7 +111,7 @@ def parse(arguments: Sequence[str]) -> Render:
     """Return the options; the pipeline named among them decides which settings there are."""
     before = ["", *arguments]
     is_bake = any(a.endswith(BAKE_SUFFIX) and b != "--bake" for a, b in zip(arguments, before, strict=False))
-    settings = pipeline_named(value_given(arguments, "--pipeline") or ("probe_view" if is_bake else "path"))
+    settings = pipeline_named(value_given(arguments, "--pipeline") or ("probe_view" if is_bake else DEFAULT))
     if denoiser := value_given(arguments, "--denoise"):
         settings = replace(settings, denoise=find_denoiser(denoiser))
     options = parse_options(Render, "render", arguments, DESCRIPTION, Render(settings=settings))
