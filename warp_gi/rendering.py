@@ -13,6 +13,7 @@ from warp_gi.pipeline import DEFAULT, Pipeline
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.sky_motion import sky_start
 from warp_gi.scheduler import FrameScheduler
+from warp_gi.sequence.frame_time import check_seconds, samples_within, take_time
 from warp_gi.sequence.resume import Output, Plan, SequenceRun, shots_of
 from warp_gi.stateful import Stateful
 
@@ -39,6 +40,7 @@ def render(
     precision: Literal["half", "float"] = "half",
     preview: bool = False,
     exposure: float = 0.0,
+    frame_time: float | None = None,
 ) -> Iterator[Frame]:
     """Yield the frames of a sequence, and write them to files if there is an ``output``.
 
@@ -67,6 +69,9 @@ def render(
         precision: Storage of colours and normals in EXR files: "half" or "float".
         preview: Write a tone-mapped PNG beside each EXR file.
         exposure: Exposure of PNG files in stops.
+        frame_time: Wall seconds that a frame may take here; the number of samples a pixel then follows from frames
+            that are timed first. It is one for all frames, and in their metadata: a resumed sequence repeats it. The
+            first frame may take more (``SpatioTemporal.first_samples``). None takes those of the pipeline.
 
     Raises OptionError for a device that is not there, a negative frame or seed, files that frames cannot be, several
     frames for one file; BakeError for a bake of another scene or other settings; SceneError for a scene that was
@@ -74,9 +79,16 @@ def render(
     """
     if output is None and (resume or preview or exposure or precision != "half"):
         raise OptionError('resume, precision, preview and exposure are of files; give output="out/shot.####.exr" too')
+    if frame_time is not None:
+        check_seconds(frame_time)
     wanted = _frame_numbers(camera, frames)
     scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, progress, bakes)
     if output is None:
+        if frame_time is not None and wanted:
+            scheduler.take_samples(
+                samples_within(scheduler, shots_of(camera, list(dict.fromkeys(wanted)), "#.exr"), frame_time),
+                frame_time,
+            )
         for position, index in enumerate(wanted):
             if index not in skip:
                 yield scheduler.frame(index, wanted[position - 1] if position else None)
@@ -86,6 +98,8 @@ def render(
     if not shots:
         return
     run = SequenceRun(scheduler, shots, files)
+    if frame_time is not None:
+        take_time(run, frame_time, resume)
     plan = run.plan(resume)
     run.prepare(plan)
     for shot in plan.todo:
