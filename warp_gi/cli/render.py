@@ -47,7 +47,7 @@ Settings of the pipeline are flags by term: --indirect.max-depth 4. Where one es
 transfer, one flag sets both: --environment.resolution 512; give both flags for two values.
 
   warp-gi render
-  warp-gi render hall.glb --environment city.exr --camera path.json --frames 0-47 --spp 64
+  warp-gi render hall.glb --environment city.exr --camera path.json --frames 0-47
   warp-gi render hall.glb --eye 4 1.7 2 --target -3 1.6 -0.5 -o out/still.exr --preview
   warp-gi render hall.glb --pipeline dvf --bake out/hall.dvf.safetensors --environment-turn 2
   warp-gi render hall.glb --environment sky.####.exr --camera path.json --frames 0-47
