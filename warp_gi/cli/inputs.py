@@ -40,8 +40,9 @@ class SceneOptions:
     scale: float = 1.0
     """Length in metres of one unit of the file."""
     environment: Annotated[str, flag("SKY", "the scene's own; files: none")] = ""
-    """Sky of the scene: a latitude-longitude EXR or HDR file, a radiance R,G,B, sun-sky, or none. In sky.####.exr the
-    frame's number takes the place of ####, so that each frame has a sky of its own."""
+    """Sky of the scene: a latitude-longitude EXR or HDR file, a radiance R,G,B, sun-sky, or none. FILE:layer
+    chooses a part or layer of an EXR file. In sky.####.exr the frame's number takes the place of ####, so that each
+    frame has a sky of its own."""
     environment_rotation: float = 0.0
     """Angle in degrees by which the sky is turned about +y, counter-clockwise seen from above."""
     environment_scale: float = 1.0

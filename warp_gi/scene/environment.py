@@ -25,11 +25,12 @@ import numpy as np
 import warp as wp
 
 from warp_gi.alias import AliasTable
-from warp_gi.color import LUMINANCE, decode_srgb
-from warp_gi.errors import OptionError, SceneError, one_line
+from warp_gi.color import LUMINANCE
+from warp_gi.errors import OptionError, SceneError
 from warp_gi.kernels import types
 from warp_gi.launch import get_device, on_device
 from warp_gi.scene import harmonics
+from warp_gi.scene.files.sky_images import check_size, read_sky, split_layer
 from warp_gi.scene.model import Color
 from warp_gi.scene.sky import SunSky, node_solid_angles
 from warp_gi.scene.sun import LAMPS_SHARE, MOST_SUNS, MapSplit, split_map
@@ -39,7 +40,6 @@ T = TypeVar("T")
 
 __all__ = ["Environment", "SunSky", "SunSplit", "as_environment"]
 
-LARGEST_HEIGHT = 4096  # texel coordinates must be exact in float32 with bits left to interpolate
 NEGLIGIBLE_NEGATIVE = 1e-4  # share of the sum of all pixels; less is set to 0
 
 
@@ -141,13 +141,19 @@ class Environment:
             self._map = SkyMap(self.pixels)
 
     @staticmethod
-    def load(path: str | Path, rotation: float = 0.0, scale: float = 1.0) -> Environment:
+    def load(path: str | Path, rotation: float = 0.0, scale: float = 1.0, layer: str = "") -> Environment:
         """Read a 2:1 latitude-longitude image (EXR, HDR or what else OpenImageIO reads; integers as sRGB).
 
-        Raises SceneError if the file is missing or damaged, not 2:1, or has NaN or infinite pixels.
-        Negative pixels, which resampling filters leave behind, are set to 0; with a warning if they matter.
+        ``layer`` is a part or a layer of an EXR file by name; "FILE:layer" as ``path`` says the same. Without it the
+        one is read that has colors, or is the beauty; see ``files.sky_images.read_sky`` for all that is converted.
+
+        Raises SceneError if the file is missing or damaged, deep, not 2:1, or has NaN or infinite pixels; and one
+        that lists the layers if none of that name is there, or it is not clear which one is meant.
+        Negative pixels, which resampling filters and other primaries leave, are set to 0; with a warning if they
+        matter.
         """
-        pixels = _read_image(Path(path))
+        file, named = split_layer(path)
+        pixels = read_sky(file, layer or named)
         name = f"environment {str(path)!r}"
         if pixels.min() < 0:
             if -pixels[pixels < 0].sum() > NEGLIGIBLE_NEGATIVE * np.abs(pixels).sum():
@@ -347,53 +353,10 @@ def _checked_pixels(pixels: object, name: str) -> np.ndarray:
     if pixels.ndim != 3 or pixels.shape[2] != 3:
         raise SceneError(f"{name}: expected pixels of shape [height, 2 * height, 3], got {list(pixels.shape)}")
     height, width = pixels.shape[:2]
-    if width != 2 * height or height < 2:
-        raise SceneError(
-            f"{name}: a latitude-longitude map is twice as wide as high and at least 4x2, got {width}x{height};"
-            " convert or crop it"
-        )
-    if height > LARGEST_HEIGHT:
-        raise SceneError(f"{name}: at most {2 * LARGEST_HEIGHT}x{LARGEST_HEIGHT} is supported, got {width}x{height}")
+    check_size(name, width, height)
     if not np.isfinite(pixels).all():
         bad = int((~np.isfinite(pixels).all(-1)).sum())
         raise SceneError(f"{name}: {bad} pixels are NaN or infinite; repair the image")
     if pixels.min() < 0:
         raise SceneError(f"{name}: radiance must not be negative, lowest is {pixels.min():.3g}")
     return pixels
-
-
-def _read_image(path: Path) -> np.ndarray:
-    import OpenImageIO as oiio
-
-    name = f"environment {str(path)!r}"
-    if not path.is_file():
-        hint = (
-            "give gi.SkySequence(...) for a file a frame"
-            if "#" in path.name
-            else "give a latitude-longitude EXR or HDR image"
-        )
-        raise SceneError(f"{name}: no such file; {hint}")
-    if path.stat().st_size == 0:
-        raise SceneError(f"{name}: the file is empty")
-    image = oiio.ImageInput.open(str(path))
-    if image is None:
-        raise SceneError(f"{name}: not an image that can be read ({one_line(oiio.geterror(), 'no reason given')})")
-    try:
-        spec = image.spec()
-        if spec.width < 1 or spec.height < 1:
-            raise SceneError(f"{name}: the image has no pixels ({spec.width}x{spec.height})")
-        pixels = image.read_image(0, 0, 0, spec.nchannels, oiio.FLOAT)
-        if pixels is None or image.has_error:
-            raise SceneError(
-                f"{name}: the image is damaged or cut short ({one_line(image.geterror(), 'no reason given')})"
-            )
-    finally:
-        image.close()
-    names = [channel.upper() for channel in spec.channelnames]
-    colors = [names.index(c) for c in "RGB"] if {"R", "G", "B"} <= set(names) else [0, 1, 2]
-    if spec.nchannels < 3:
-        colors = [0, 0, 0]
-    pixels = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)[..., colors]
-    if spec.format.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE):
-        pixels = decode_srgb(pixels)
-    return np.ascontiguousarray(pixels)

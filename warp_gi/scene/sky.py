@@ -9,15 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from warp_gi.color import RGB_FROM_XYZ
 from warp_gi.errors import OptionError
 from warp_gi.scene.model import Color
 
 EFFICACY = 179.0  # lm/W that turns luminance into the radiance of an RGB channel (equal-energy white)
 SUN_ILLUMINANCE = 133_300.0  # lx outside the atmosphere
 SUN_TEMPERATURE = 5778.0  # K
-RGB_FROM_XYZ = np.array(
-    [[3.2404542, -1.5371385, -0.4985314], [-0.9692660, 1.8760108, 0.0415560], [0.0556434, -0.2040259, 1.0572252]]
-)
 # Preetham et al., appendix A.2: A to E of each channel's distribution, linear in turbidity ...
 DISTRIBUTION = {
     "Y": np.array(

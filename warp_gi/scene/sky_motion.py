@@ -12,6 +12,7 @@ from typing import cast
 from warp_gi.errors import SceneError
 from warp_gi.files import frame_path, frames_there
 from warp_gi.scene.environment import Environment, Sky, as_environment
+from warp_gi.scene.files.sky_images import split_layer
 
 ROUNDING = 1e-12
 """Relative error that a whole number of steps may have, once it was divided by ``fps`` and multiplied by it again."""
@@ -63,17 +64,24 @@ class SkySequence:
     """
 
     pattern: str | Path
-    """Name of the files, 2:1 latitude-longitude images; the last run of # is the frame's number, padded with zeros."""
+    """Name of the files, 2:1 latitude-longitude images; the last run of # is the frame's number, padded with zeros.
+    In "sky.####.exr:beauty" the layer follows, as in ``Environment.load``."""
     fps: float = 24.0
     """Files per second: the fps of the camera path, where each of its frames has a file."""
     rotation: float = 0.0
     """Angle in degrees by which every sky is turned about +y."""
     scale: float = 1.0
     """Factor on the radiance of every sky."""
+    layer: str = ""
+    """Layer of every file; "" is its only one, or the beauty."""
     _kept: dict[tuple[object, ...], Environment] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         _check_fps("a sequence of skies", self.fps)
+        pattern, layer = split_layer(self.pattern)
+        if layer:
+            object.__setattr__(self, "pattern", pattern)
+            object.__setattr__(self, "layer", layer)
         if "#" not in Path(self.pattern).name:
             raise SceneError(f"{self.pattern}: put #### where the number of the frame is, as in sky.####.exr")
         if not frames_there(self.pattern):
@@ -88,7 +96,7 @@ class SkySequence:
         """Return the sky at ``time`` [s]."""
         number = math.floor(_steps(time, self.fps))
         self.check([number])
-        what = frame_path(self.pattern, number), self.rotation, self.scale
+        what = frame_path(self.pattern, number), self.rotation, self.scale, self.layer
         sky = self._kept.get(what)
         if sky is None:
             sky = Environment.load(*what)
