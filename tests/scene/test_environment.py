@@ -535,8 +535,10 @@ def test_sun_sky_settings():
     sky = SunSky.towards((1.0, 1.0, 0.0), turbidity=4.0)
     assert sky.azimuth == pytest.approx(90) and sky.elevation == pytest.approx(45) and sky.turbidity == 4.0
     assert np.allclose(sky.direction, [math.sqrt(0.5), math.sqrt(0.5), 0])
-    for settings in ({"elevation": -5.0}, {"turbidity": 50.0}, {"height": 3}, {"ground_albedo": (2, 0, 0)}):
+    for settings in ({"elevation": -7.0}, {"turbidity": 50.0}, {"height": 3}, {"ground_albedo": (2, 0, 0)}):
         with pytest.raises(OptionError, match=next(iter(settings))):
             SunSky(**settings)
-    with pytest.raises(OptionError, match="above the horizon"):
+    with pytest.raises(OptionError, match="elevation must be between -6"):
         SunSky.towards((0, -1, 0))
+    with pytest.raises(OptionError, match="must not be zero"):
+        SunSky.towards((0, 0, 0))

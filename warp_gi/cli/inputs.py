@@ -72,6 +72,8 @@ def open_scene(name: str, smooth: float | None = None, scale: float = 1.0) -> Sc
 def find_scene(options: SceneOptions) -> Scene:
     """Return the scene that was asked for, with its sky."""
     scene = open_scene(options.scene or DEFAULT_SCENE, options.smooth, options.scale)
+    if options.sun != SunSky() and options.environment != "sun-sky":
+        raise OptionError("--sun.elevation and other --sun flags go with --environment sun-sky; give that too")
     if options.environment:
         scene.environment = parse_environment(options)
     elif options.environment_rotation or options.environment_scale != 1.0:

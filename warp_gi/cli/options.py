@@ -17,6 +17,7 @@ Options = TypeVar("Options")
 
 _PLAIN = (
     (r"Error parsing settings\.([\w.]+): ", r"\1: "),
+    (r"Error parsing sun: ", ""),
     (r"Error parsing (--[\w.-]+): invalid literal for int\(\) with base 10: ", r"\1 must be a whole number, got "),
     (r"Error parsing (--[\w.-]+): could not convert string to float: ", r"\1 must be a number, got "),
     (

@@ -1,21 +1,31 @@
 """A clear sky with a sun, by the closed formulas of Preetham, Shirley and Smits,
 "A Practical Analytic Model for Daylight" (SIGGRAPH 1999), as a latitude-longitude map.
+
+They end with the sun at the horizon. Below it, the sky of the horizon dims as the light on the ground does in Janiczek
+and DeYoung, "Computer Programs for Sun and Moon Illuminance" (USNO Circular 171, 1987), without a change of color.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from datetime import datetime
 
 import numpy as np
 
 from warp_gi.color import RGB_FROM_XYZ
 from warp_gi.errors import OptionError
 from warp_gi.scene.model import Color
+from warp_gi.scene.solar_position import sun_position
 
 EFFICACY = 179.0  # lm/W that turns luminance into the radiance of an RGB channel (equal-energy white)
 SUN_ILLUMINANCE = 133_300.0  # lx outside the atmosphere
 SUN_TEMPERATURE = 5778.0  # K
+SUN_RADIUS = 0.265  # degrees, as it is, to tell how much of it has set
+LOWEST_SUN = -6.0  # degrees: the end of civil twilight
+# Janiczek and DeYoung: log10 of lx on the ground as a cubic in the sun's elevation / 90 degrees, rising powers; of the
+# elevations from -0.8 to -5 degrees, and from there to -12.
+TWILIGHT = ((-5.0, (2.88, 21.81, -258.11, -858.36)), (-12.0, (2.70, 12.17, -431.69, -1899.83)))
 # Preetham et al., appendix A.2: A to E of each channel's distribution, linear in turbidity ...
 DISTRIBUTION = {
     "Y": np.array(
@@ -47,14 +57,22 @@ ZENITH = {
 }
 
 
+class _OfDate(float):
+    """An angle that follows from a date, so that ``dataclasses.replace`` may compute it again."""
+
+
 @dataclass(frozen=True)
 class SunSky:
-    """A clear sky and its sun over a Lambertian ground."""
+    """A clear sky and its sun over a Lambertian ground, at given angles or at a date and place on earth.
+
+    Raises OptionError for numbers out of range, a date without a time zone or without a place, a place or angles that
+    the date makes senseless, and for a sun below -6 degrees.
+    """
 
     elevation: float = 45.0
-    """Angle of the sun above the horizon, degrees in (0, 90]."""
+    """Angle of the sun above the horizon, degrees in [-6, 90]. Below 0 the sky dims to dusk. A date sets it."""
     azimuth: float = 0.0
-    """Angle of the sun in degrees, clockwise seen from above, as on a compass: 0 is -z, 90 is +x."""
+    """Angle of the sun in degrees, clockwise seen from above, as on a compass: 0 is -z, 90 is +x. A date sets it."""
     turbidity: float = 3.0
     """Haze of the air, from 1.7 to 10: 2 is very clear, 6 is hazy."""
     ground_albedo: Color = (0.2, 0.2, 0.2)
@@ -68,10 +86,19 @@ class SunSky:
     height: int = 512
     """Number of rows of the map; columns are twice as many. The sun is blurred by about one texel, 180 / height
     degrees."""
+    date: datetime | None = None
+    """Time, with a time zone, at which the sun stands where it does at a place; elevation and azimuth follow."""
+    latitude: float | None = None
+    """Latitude of the place in degrees, positive north of the equator; goes with a date."""
+    longitude: float | None = None
+    """Longitude of the place in degrees, positive east of Greenwich; goes with a date."""
+    north: float = 0.0
+    """Angle of north in degrees, clockwise seen from above: 0 is -z, 90 is +x; goes with a date."""
 
     def __post_init__(self) -> None:
+        self._follow_date()
         for name, low, high in (
-            ("elevation", 0.0, 90.0),
+            ("elevation", LOWEST_SUN, 90.0),
             ("azimuth", -3600.0, 3600.0),
             ("turbidity", 1.7, 10.0),
             ("intensity", 0.0, math.inf),
@@ -80,32 +107,66 @@ class SunSky:
             ("height", 16, 4096),
         ):
             value = getattr(self, name)
-            if not (low <= value <= high and math.isfinite(value)) or (name == "elevation" and value == 0):
+            if not (low <= value <= high and math.isfinite(value)):
                 raise OptionError(f"SunSky {name} must be between {low} and {high}, got {value}")
         if len(self.ground_albedo) != 3 or not all(0 <= a <= 1 for a in self.ground_albedo):
             raise OptionError(f"SunSky ground_albedo must be three numbers between 0 and 1, got {self.ground_albedo}")
+
+    def _follow_date(self) -> None:
+        """Set elevation and azimuth to where the sun stands, if there is a date."""
+        if self.date is None:
+            if self.latitude is not None or self.longitude is not None or self.north:
+                raise OptionError("SunSky latitude, longitude and north go with a date; give date too")
+            return
+        if self.date.tzinfo is None or self.date.utcoffset() is None:
+            raise OptionError(
+                f"SunSky date must have a time zone, got {self.date.isoformat()}; for example"
+                f" {self.date.isoformat()}+02:00, or tzinfo=timezone.utc"
+            )
+        for name, most in (("latitude", 90.0), ("longitude", 180.0), ("north", 360.0)):
+            value = getattr(self, name)
+            if value is None:
+                raise OptionError(f"SunSky date needs a place; give {name} in degrees too")
+            if not -most <= value <= most:
+                raise OptionError(f"SunSky {name} must be between {-most:g} and {most:g} degrees, got {value}")
+        for name in ("elevation", "azimuth"):
+            value = getattr(self, name)
+            if value != SunSky.__dataclass_fields__[name].default and not isinstance(value, _OfDate):
+                raise OptionError(f"SunSky {name} follows from its date; leave one of the two out")
+        assert self.latitude is not None and self.longitude is not None
+        elevation, azimuth = sun_position(self.date, self.latitude, self.longitude)
+        if elevation < LOWEST_SUN:
+            raise OptionError(
+                f"SunSky: at {self.date.isoformat()} the sun is {-elevation:.1f} degrees below the horizon, and this"
+                f" sky ends at {-LOWEST_SUN:g}; take another time, or Environment.constant for the night"
+            )
+        object.__setattr__(self, "elevation", _OfDate(elevation))
+        object.__setattr__(self, "azimuth", _OfDate((azimuth + self.north) % 360.0))
 
     @staticmethod
     def towards(direction: tuple[float, float, float], **settings: float) -> SunSky:
         """Return a SunSky whose sun stands in a direction (x, y, z), y up; ``settings`` are the other fields."""
         x, y, z = direction
-        if not y > 0:
-            raise OptionError(f"SunSky: the sun must stand above the horizon (y > 0), got direction {direction}")
+        if not any(direction):
+            raise OptionError(f"SunSky: the direction of the sun must not be zero, got {direction}")
         elevation = math.degrees(math.atan2(y, math.hypot(x, z)))
         return SunSky(elevation=elevation, azimuth=math.degrees(math.atan2(x, -z)) % 360.0, **settings)  # type: ignore[arg-type]
 
     @property
     def direction(self) -> np.ndarray:
         """Unit direction towards the sun, float64 [3]."""
-        elevation, azimuth = math.radians(self.elevation), math.radians(self.azimuth)
-        flat = math.cos(elevation)
-        return np.array([flat * math.sin(azimuth), math.sin(elevation), -flat * math.cos(azimuth)])
+        return _direction(self.elevation, self.azimuth)
 
     @property
     def sun_irradiance(self) -> np.ndarray:
-        """Irradiance of a surface that faces the sun, by the sun alone, W/m^2 a channel, float64 [3]."""
-        scale = self.intensity * self.sun_intensity / EFFICACY
-        return np.maximum(RGB_FROM_XYZ @ _sun_xyz(math.radians(90 - self.elevation), self.turbidity), 0) * scale
+        """Irradiance of a surface that faces the sun, by what has not set of it, W/m^2 a channel, float64 [3]."""
+        scale = self.intensity * self.sun_intensity / EFFICACY * _share_above(self.elevation / SUN_RADIUS)
+        return np.maximum(RGB_FROM_XYZ @ _sun_xyz(self._sun_theta, self.turbidity), 0) * scale
+
+    @property
+    def _sun_theta(self) -> float:
+        """Angle of the sun from the zenith in radians, at most to the horizon, where the formulas end."""
+        return math.radians(90 - max(self.elevation, 0.0))
 
     def pixels(self) -> np.ndarray:
         """Return float32 [height, 2 * height, 3] radiance, oriented as ``Environment`` says."""
@@ -114,9 +175,9 @@ class SunSky:
         phi = (np.arange(width) + 0.5) * (2 * math.pi / width)
         sky_rows = (height + 1) // 2
         cos_theta, sin_theta = np.cos(theta[:sky_rows, None]), np.sin(theta[:sky_rows, None])
-        sun = self.direction
+        sun = _direction(max(self.elevation, 0.0), self.azimuth)
         cos_gamma = sin_theta * (np.sin(phi) * sun[0] - np.cos(phi) * sun[2]) + cos_theta * sun[1]
-        sky = _preetham(cos_theta, cos_gamma, math.radians(90 - self.elevation), self.turbidity)
+        sky = _preetham(cos_theta, cos_gamma, self._sun_theta, self.turbidity) * _dusk(self.elevation)
         pixels = np.zeros((height, width, 3))
         pixels[:sky_rows] = np.maximum(sky @ RGB_FROM_XYZ.T, 0) * (self.intensity * 1000.0 / EFFICACY)
         areas = node_solid_angles(height, width)
@@ -138,6 +199,8 @@ class SunSky:
         across = np.cos(turn.ravel())[:, None] * side + np.sin(turn.ravel())[:, None] * np.cross(axis, side)
         points = np.cos(radius)[:, None] * axis + np.sin(radius)[:, None] * across
         points = points[points[:, 1] >= 0]
+        if not len(points) or not self.sun_irradiance.any():
+            return
         x = np.arctan2(points[:, 0], -points[:, 2]) / (2 * math.pi) % 1.0 * width - 0.5
         y = np.arccos(np.clip(points[:, 1], -1, 1)) / math.pi * (height - 1)
         column, row = np.floor(x).astype(int), np.minimum(y.astype(int), height - 2)
@@ -154,6 +217,26 @@ def node_solid_angles(height: int, width: int) -> np.ndarray:
     result = np.sin(np.arange(height) * step) * (2 * (1 - math.cos(step)) / step)
     result[[0, -1]] = 1 - math.sin(step) / step
     return result * (2 * math.pi / width)
+
+
+def _direction(elevation: float, azimuth: float) -> np.ndarray:
+    """Return the unit vector of angles in degrees, float64 [3]."""
+    up, turn = math.radians(elevation), math.radians(azimuth)
+    return np.array([math.cos(up) * math.sin(turn), math.sin(up), -math.cos(up) * math.cos(turn)])
+
+
+def _share_above(height: float) -> float:
+    """Return the share of a unit disc that is above a line, whose middle is at ``height`` above it."""
+    h = min(max(height, -1.0), 1.0)
+    return 0.5 + (math.asin(h) + h * math.sqrt(1 - h * h)) / math.pi
+
+
+def _dusk(elevation: float) -> float:
+    """Return the light of the sky with the sun at an elevation in degrees, over that with it at the horizon."""
+    if elevation >= 0:
+        return 1.0
+    terms = next(terms for lowest, terms in TWILIGHT if elevation >= lowest)
+    return 10.0 ** (np.polynomial.Polynomial(terms)(elevation / 90.0) - TWILIGHT[0][1][0])
 
 
 def _preetham(cos_theta: np.ndarray, cos_gamma: np.ndarray, sun_theta: float, turbidity: float) -> np.ndarray:
