@@ -83,6 +83,7 @@ def render(
         check_seconds(frame_time)
     wanted = _frame_numbers(camera, frames)
     scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, progress, bakes)
+    camera = scheduler.camera
     if output is None:
         if frame_time is not None and wanted:
             scheduler.take_samples(
@@ -132,7 +133,7 @@ def plan_sequence(
     wanted = _frame_numbers(camera, frames)
     scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, progress, bakes)
     files = Output(Path(output), precision)
-    shots = shots_of(camera, wanted, files.pattern)
+    shots = shots_of(scheduler.camera, wanted, files.pattern)
     return SequenceRun(scheduler, shots, files).plan() if shots else Plan((), ())
 
 
@@ -164,6 +165,8 @@ def bake(
     if camera is not None and camera_path is not None:
         raise OptionError("camera and camera_path are two names of one argument; give camera")
     camera = camera_path if camera is None else camera
+    if camera is not None:
+        camera = camera.relative_to(scene.offset)
     told = (lambda share: progress("bake", share)) if progress else None
     with scene.lock:
         scene.check_unchanged()

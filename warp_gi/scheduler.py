@@ -92,7 +92,7 @@ class FrameScheduler:
             raise OptionError(f"seed must be 0 or above, got {seed}")
         self.scene = BakedScene(scene) if isinstance(scene, Bake) else scene
         self.pipeline = pipeline.fitting(scene) if isinstance(scene, Bake) else pipeline
-        self.camera, self.seed = camera, seed
+        self.camera, self.seed = camera.relative_to(self.scene.offset), seed
         self.device = launch.get_device(device)
         self._progress = progress or (lambda stage, share: None)
         self._parts = self.pipeline.parts()

@@ -12,6 +12,7 @@ from warp_gi.cli.inputs import open_scene
 from warp_gi.cli.options import parse_options
 from warp_gi.cli.report import print_table, start_warp
 from warp_gi.scene.model import Material
+from warp_gi.scene.pinhole import offset_text
 from warp_gi.scene.scene import Scene
 from warp_gi.scene.textures import distinct_textures
 
@@ -71,6 +72,7 @@ def summary(scene: Scene) -> list[tuple[str, object]]:
         ("sky, mean radiance", "none" if sky is None else _numbers(sky.mean_radiance)),
         ("cameras", len(scene.cameras)),
         ("animation [s]", scene.duration if scene.is_animated else "none"),
+        *([("recentred by [m]", offset_text(scene.offset))] if scene.offset.any() else []),
         ("lowest corner [m]", _numbers(low)),
         ("highest corner [m]", _numbers(high)),
         ("memory [MB]", scene.memory_bytes / 1e6),

@@ -39,6 +39,9 @@ class SceneOptions:
     """Crease angle in degrees: meshes of a file without normals get smooth ones, except across edges that bend more."""
     scale: float = 1.0
     """Length in metres of one unit of the file."""
+    recentre: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Take the middle of the scene from all positions, in double precision. That is done without being asked where
+    float32 has steps of more than a millimetre. Cameras stay in the file's coordinates; frames say what was taken."""
     environment: Annotated[str, flag("SKY", "the scene's own; files: none")] = ""
     """Sky of the scene: a latitude-longitude EXR or HDR file, a radiance R,G,B, sun-sky, or none. FILE:layer
     chooses a part or layer of an EXR file. In sky.####.exr the frame's number takes the place of ####, so that each
@@ -58,20 +61,20 @@ class SceneOptions:
     """Horizontal field of view of a still camera in degrees."""
 
 
-def open_scene(name: str, smooth: float | None = None, scale: float = 1.0) -> Scene:
-    """Return a built-in scene by name, or one from a file (``smooth`` and ``scale`` are those of ``load_scene``)."""
+def open_scene(name: str, smooth: float | None = None, scale: float = 1.0, recentre: bool | None = None) -> Scene:
+    """Return a built-in scene by name, or one from a file (the other arguments are those of ``load_scene``)."""
     if name in BUILTIN_SCENES and not Path(name).is_file():
-        if smooth is not None or scale != 1.0:
-            raise OptionError(f"--smooth and --scale go with a scene from a file; {name} is built in")
+        if smooth is not None or scale != 1.0 or recentre:
+            raise OptionError(f"--smooth, --scale and --recentre go with a scene from a file; {name} is built in")
         return builtin_scene(name)
     if not Path(name).suffix and not Path(name).exists():
         raise unknown_name("scene", name, BUILTIN_SCENES)
-    return load_scene(name, smooth=smooth, scale=scale)
+    return load_scene(name, smooth=smooth, scale=scale, recentre=recentre)
 
 
 def find_scene(options: SceneOptions) -> Scene:
     """Return the scene that was asked for, with its sky."""
-    scene = open_scene(options.scene or DEFAULT_SCENE, options.smooth, options.scale)
+    scene = open_scene(options.scene or DEFAULT_SCENE, options.smooth, options.scale, options.recentre or None)
     if options.sun != SunSky() and options.environment != "sun-sky":
         raise OptionError("--sun.elevation and other --sun flags go with --environment sun-sky; give that too")
     if options.environment:
@@ -122,7 +125,11 @@ def move_sky(scene: Scene, turn: float, camera: Camera | CameraPath, frames: Ite
 
 
 def find_camera(options: SceneOptions, scene: Scene | BakedScene, report: Reporter) -> Camera | CameraPath:
-    """Return the camera or path that was asked for."""
+    """Return the camera or path that was asked for, counted from where the scene's positions are."""
+    return _find_camera(options, scene, report).relative_to(scene.offset)
+
+
+def _find_camera(options: SceneOptions, scene: Scene | BakedScene, report: Reporter) -> Camera | CameraPath:
     if options.hfov is not None and not 0.0 < options.hfov < 180.0:
         raise OptionError(f"--hfov must be between 0 and 180 degrees, got {options.hfov:g}")
     if options.eye is not None or options.target is not None:
@@ -176,7 +183,9 @@ def overview(scene: Scene, hfov: float) -> Camera:
     direction = np.array([0.6, 0.45, 0.66]) / np.linalg.norm([0.6, 0.45, 0.66])
     distance = scene.radius / math.sin(math.radians(hfov) / 2)
     center = (low + high) / 2
-    return Camera.look_at(center + distance * direction, center, hfov=hfov)
+    camera = Camera.look_at(center + distance * direction, center, hfov=hfov)
+    x, y, z = scene.offset.tolist()
+    return replace(camera, offset=(x, y, z))
 
 
 def parse_resolution(text: str) -> tuple[int, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -52,6 +53,18 @@ def keyframe_matrix(keyframes: Sequence[Keyframe], time: float) -> np.ndarray:
     translation = (1.0 - weight) * np.asarray(a.translation) + weight * np.asarray(b.translation)
     scale = (1.0 - weight) * np.asarray(a.scale) + weight * np.asarray(b.scale)
     return pose_matrix(translation, slerp(a.rotation, b.rotation, weight), scale)
+
+
+def moved_keyframes(keyframes: Sequence[Keyframe], move: np.ndarray) -> list[Keyframe]:
+    """Return keyframes with ``move`` [3] added to their translations; the same ones if it is zero."""
+    if not move.any():
+        return list(keyframes)
+    return [replace(key, translation=tuple((np.array(key.translation) + move).tolist())) for key in keyframes]
+
+
+def set_keyframes(node: Node, keyframes: Sequence[Keyframe], offset: np.ndarray) -> None:
+    """Give a node keyframes; of those of a root, which are in a file's coordinates, ``offset`` [3] is taken."""
+    node.keyframes = moved_keyframes(keyframes, -offset) if node.parent is None else list(keyframes)
 
 
 def world_matrices(nodes: Sequence[Node], time: float) -> list[np.ndarray]:

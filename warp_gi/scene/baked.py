@@ -44,6 +44,8 @@ class BakedScene:
         self.contents_hash = bake.scene_key
         self.hash = bake.digest
         self.cameras: dict[str, Camera] = {}
+        self.offset = np.array(bake.arrays.get("offset", (0.0, 0.0, 0.0)), np.float64)
+        """That of the scene, as in ``Scene.offset``."""
 
     @property
     def lock(self) -> threading.RLock:

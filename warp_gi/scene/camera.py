@@ -56,6 +56,8 @@ class CameraPath:
     """Width and height in pixels."""
     name: str = field(default="", compare=False)
     """Name in messages and reports."""
+    offset: Vec3 = (0.0, 0.0, 0.0)
+    """Point in metres of a file's coordinates that the keys count from: that of a recentred scene."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "keys", tuple(self.keys))
@@ -82,7 +84,16 @@ class CameraPath:
         """Return the camera at a time in seconds, held before the first and after the last key."""
         rows = np.array([[*k.eye, *k.target, *k.up, k.hfov] for k in self.keys], dtype=np.float64)
         pose = _hermite(np.array([k.time for k in self.keys]), rows, time)
-        return Camera.look_at(pose[0:3], pose[3:6], pose[6:9], float(pose[9]), self.resolution, self.name)
+        camera = Camera.look_at(pose[0:3], pose[3:6], pose[6:9], float(pose[9]), self.resolution, self.name)
+        return replace(camera, offset=self.offset)
+
+    def relative_to(self, offset: Sequence[float] | np.ndarray) -> CameraPath:
+        """Return the same path, counted from another point of the file's coordinates (as of ``Scene.offset``)."""
+        if np.array_equal(self.offset, offset):
+            return self
+        move = np.subtract(self.offset, offset)
+        keys = [replace(k, eye=_three(move + k.eye), target=_three(move + k.target)) for k in self.keys]
+        return replace(self, keys=tuple(keys), offset=_three(offset))
 
     def at_resolution(self, width: int, height: int) -> CameraPath:
         """Return the same path with another resolution."""
@@ -100,12 +111,13 @@ class CameraPath:
         """Return a path through ``cameras``, at ``times`` in seconds or one a frame."""
         cameras = list(cameras)
         times = [i / fps for i in range(len(cameras))] if times is None else list(times)
+        offset = cameras[0].offset if cameras else (0.0, 0.0, 0.0)
         keys = []
         for camera, time in zip(cameras, times, strict=True):
-            matrix = camera.world_from_camera
+            matrix = camera.relative_to(offset).world_from_camera
             target = matrix[:3, 3] - matrix[:3, 2]
             keys.append(CameraKey(time, tuple(matrix[:3, 3]), tuple(target), tuple(matrix[:3, 1]), camera.hfov))
-        return cls(tuple(keys), fps, cameras[0].resolution if cameras else (960, 540))
+        return cls(tuple(keys), fps, cameras[0].resolution if cameras else (960, 540), offset=offset)
 
     @classmethod
     def orbit(
@@ -211,7 +223,7 @@ def frame_time(camera: Camera | CameraPath, index: int) -> float:
     return index / (camera.fps if isinstance(camera, CameraPath) else STILL_FPS)
 
 
-def _three(values: Sequence[float]) -> Vec3:
+def _three(values: Sequence[float] | np.ndarray) -> Vec3:
     x, y, z = (float(v) for v in values)
     return x, y, z
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -14,16 +15,23 @@ from warp_gi.scene.files.images import missing_file
 from warp_gi.scene.files.parts import SceneParts
 from warp_gi.scene.geometry import triangulated
 from warp_gi.scene.model import Material, Mesh, Node
+from warp_gi.scene.pinhole import offset_text
 from warp_gi.scene.scene import Scene
 
 EXTENSIONS = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
 
+LARGEST_STEP = 0.001
+"""Distance in metres between neighbouring float32 coordinates from which a scene is recentred."""
 DAMAGE = (ArithmeticError, AttributeError, EOFError, LookupError, NameError, OSError, TypeError, ValueError)
 """Exceptions that readers, trimesh's among them, raise on damaged files."""
 
 
 def load_scene(
-    path: str | os.PathLike[str], environment: Sky = None, smooth: float | None = None, scale: float = 1.0
+    path: str | os.PathLike[str],
+    environment: Sky = None,
+    smooth: float | None = None,
+    scale: float = 1.0,
+    recentre: bool | None = None,
 ) -> Scene:
     """Load a scene from a GLB, glTF, OBJ (with MTL), PLY, STL or OFF file.
 
@@ -33,6 +41,10 @@ def load_scene(
         smooth: Crease angle in degrees. Meshes without normals get smooth ones except across
             edges that bend more than this; None leaves them flat, as glTF asks.
         scale: Metres in one unit of the file. Radiance and intensities are left as they are.
+        recentre: Whether to take the middle of the scene, in whole units, from all positions in double precision.
+            ``Scene.offset`` is what was taken: nodes, bounds and the buffer "position" are without it. Cameras, and
+            keyframes for ``Scene.animate``, are still given in the file's coordinates. None does so, with a warning,
+            where float32 has steps of more than a millimetre.
 
     Raises SceneError if the file or anything it names is missing, damaged or unusable: one line.
     """
@@ -56,13 +68,34 @@ def load_scene(
         raise SceneError(
             f"{str(path)!r} cannot be read as {kind} ({type(error).__name__}: {reason}); export or copy it again"
         ) from error
+    parts = _recentred(parts, path, scale, recentre).single()
     if smooth is not None:
         parts = parts.smoothed(smooth)
     if scale != 1.0:
         parts = parts.scaled(scale)
     if not any(len(mesh.indices) for node in parts.nodes for mesh in node.meshes):
         raise SceneError(f"{str(path)!r} holds no triangles; export it with faces")
-    return Scene(parts.nodes, parts.lights, environment, parts.cameras, path.stem, parts.camera_nodes)
+    scene = Scene(parts.nodes, parts.lights, environment, parts.cameras, path.stem, parts.camera_nodes)
+    scene.offset = parts.offset
+    return scene
+
+
+def _recentred(parts: SceneParts, path: Path, scale: float, recentre: bool | None) -> SceneParts:
+    """Return the parts around the origin, if that is asked for, or is needed and not refused."""
+    if recentre is False:
+        return parts
+    offset = np.round(parts.middle())
+    farthest = float(np.abs(offset).max()) * scale
+    step = float(np.spacing(np.float32(farthest)))
+    if recentre is None and not step > LARGEST_STEP:
+        return parts
+    if recentre is None:
+        warnings.warn(
+            f"{str(path)!r} lies {farthest:,.0f} m from its origin, where float32 has steps of {1000 * step:.3g} mm:"
+            f" recentred by {offset_text(scale * offset)} m; cameras are still in the file's coordinates",
+            stacklevel=3,
+        )
+    return parts.recentred(offset)
 
 
 def _read(path: Path, suffix: str) -> SceneParts:
@@ -91,7 +124,7 @@ def _read_single_mesh(path: Path, suffix: str) -> SceneParts:
     if normals is not None and np.shape(normals) != np.shape(points):
         normals = None
     mesh = Mesh(
-        np.asarray(points, np.float32),
+        np.asarray(points),
         triangulated(np.asarray(faces)),
         Material(path.stem, specular=0.0),
         None if normals is None else np.asarray(normals, np.float32),

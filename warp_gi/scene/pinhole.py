@@ -35,6 +35,8 @@ class Camera:
     """Width and height in pixels."""
     name: str = ""
     """Name in messages and reports."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Point in metres of a file's coordinates that ``world_from_camera`` counts from: that of a recentred scene."""
 
     def __post_init__(self) -> None:
         matrix = np.array(self.world_from_camera, dtype=np.float64)
@@ -81,9 +83,17 @@ class Camera:
         """Return the same camera with another resolution."""
         return replace(self, resolution=(width, height))
 
+    def relative_to(self, offset: Vector) -> Camera:
+        """Return the same camera, counted from another point of the file's coordinates (as of ``Scene.offset``)."""
+        if np.array_equal(self.offset, offset):
+            return self
+        moved = np.array(self.world_from_camera)
+        moved[:3, 3] += np.subtract(self.offset, offset)
+        return replace(self, world_from_camera=moved, offset=(float(offset[0]), float(offset[1]), float(offset[2])))
+
     @property
     def position(self) -> np.ndarray:
-        """Position of the eye in metres, float64 [3]."""
+        """Position of the eye in metres, counted from ``offset``; float64 [3]."""
         return self.world_from_camera[:3, 3]
 
     def directions(self, pixels: np.ndarray) -> np.ndarray:
@@ -101,6 +111,11 @@ class Camera:
         scale = 0.5 * width / math.tan(math.radians(self.hfov) / 2)
         xy = local[:, :2] / -local[:, 2:] * [scale, -scale]
         return xy + np.array([0.5 * width, 0.5 * height])
+
+
+def offset_text(offset: Vector) -> str:
+    """Return an offset as files say it: three numbers that read back to the last bit."""
+    return " ".join(f"{value:.0f}" if float(value).is_integer() else repr(float(value)) for value in offset)
 
 
 def _look_at_matrix(*given: Vector) -> np.ndarray:

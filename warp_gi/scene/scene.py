@@ -44,9 +44,9 @@ class Scene:
 
     Raises SceneError if anything in it cannot be rendered: one line that names the mesh, material or light.
 
-    What pictures are made from is copied: geometry when the scene is made, and by ``animate``; materials, textures and
-    lights when it is first used on a device. An edit after that is a SceneError at the next frame, see
-    ``check_unchanged``. What works at any time is ``animate`` and an assignment of ``environment``.
+    What pictures are made from is copied: geometry when the scene is made, and by ``animate``; all else when first
+    used on a device. An edit after that is a SceneError at the next frame, see ``check_unchanged``. What works at any
+    time is ``animate`` and an assignment of ``environment``.
     """
 
     def __init__(
@@ -60,6 +60,8 @@ class Scene:
     ) -> None:
         self._guard = Guard()
         self.name = name
+        self.offset = np.zeros(3)
+        """What was taken from all positions of a file, float64 [3] in metres; see ``load_scene``'s ``recentre``."""
         self.version = 0
         """Number of changes of environment and animation so far. After another one, what was derived from the
         scene is stale."""
@@ -281,7 +283,7 @@ class Scene:
         animation.check_keyframes(keyframes, node)
         geometry.check_nodes(self.nodes)  # they are read anew, with every edit so far
         with self.lock:
-            self.nodes[matches[0]].keyframes = list(keyframes)
+            animation.set_keyframes(self.nodes[matches[0]], keyframes, self.offset)
             self._flatten()
 
     def moves(self, index: int) -> bool:

@@ -20,6 +20,7 @@ import numpy as np
 from warp_gi.errors import OptionError, SceneError
 from warp_gi.files import frame_path, replacing
 from warp_gi.scene.camera import Camera
+from warp_gi.scene.pinhole import offset_text
 from warp_gi.sequence.exr import Attribute, plain, read_exr, stored_values, write_exr
 from warp_gi.sequence.preview import tone_map, write_png
 
@@ -88,6 +89,11 @@ class FrameFile:
     """Every attribute of the file, under its own name."""
 
     @property
+    def offset(self) -> np.ndarray:
+        """What to add to the buffer "position" for the coordinates of the scene's file, float64 [3] in metres."""
+        return np.array(self.camera.offset if self.camera else (0.0, 0.0, 0.0))
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of the buffers."""
         return tuple(self.buffers)
@@ -126,7 +132,8 @@ def frame_attributes(
 
     ``worldToCamera`` and ``worldToNDC`` follow the OpenEXR standard: row vectors, a
     left-handed camera space with x right, y up and z forward; NDC from (0, 0) at the upper
-    left to (1, 1) at the lower right corner of the picture.
+    left to (1, 1) at the lower right corner of the picture. ``warp_gi/offset`` is what a recentred scene's positions,
+    and these matrices, are without: "x y z" in metres of the file's coordinates.
     """
     world_to_camera, world_to_ndc = camera_matrices(camera)
     attributes: dict[str, Attribute] = {
@@ -137,6 +144,8 @@ def frame_attributes(
         "worldToNDC": world_to_ndc,
         PREFIX + "precision": precision,
     }
+    if any(camera.offset):
+        attributes[PREFIX + "offset"] = offset_text(camera.offset)
     if previous_camera is not None:  # motion is towards it
         attributes["previousWorldToCamera"] = camera_matrices(previous_camera)[0]
     for key, value in metadata.items():
@@ -206,7 +215,8 @@ def read_frame(path: str | Path) -> FrameFile:
     if isinstance(world_to_camera, np.ndarray) and "hfov" in attributes:
         height, width = next(iter(buffers.values())).shape[:2]
         world_from_camera = np.linalg.inv(world_to_camera.astype(np.float64).T) @ np.diag([1.0, 1, -1, 1])
-        camera = Camera(world_from_camera, float(attributes["hfov"]), (width, height))
+        x, y, z = (float(value) for value in str(metadata.get("offset", "0 0 0")).split())
+        camera = Camera(world_from_camera, float(attributes["hfov"]), (width, height), offset=(x, y, z))
     return FrameFile(
         buffers,
         formats,

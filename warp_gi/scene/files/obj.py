@@ -71,7 +71,7 @@ def read_obj(path: Path) -> SceneParts:
         material_name = getattr(getattr(visual, "material", None), "name", None)
         normals, uvs = geometry.get("vertex_normals"), getattr(visual, "uv", None)
         mesh = Mesh(
-            np.asarray(geometry["vertices"], np.float32),
+            np.asarray(geometry["vertices"], np.float64),
             triangulated(np.asarray(geometry["faces"])),
             reader.material(material_name),
             None if normals is None else np.asarray(normals, np.float32),

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from warp_gi.scene.animation import moved_keyframes, world_matrices
 from warp_gi.scene.model import Mesh, Node, PunctualLight
 from warp_gi.scene.normals import smooth_mesh
 from warp_gi.scene.pinhole import Camera
@@ -19,6 +20,68 @@ class SceneParts:
     lights: list[PunctualLight] = field(default_factory=list)
     cameras: dict[str, Camera] = field(default_factory=dict)
     camera_nodes: dict[str, int] = field(default_factory=dict)
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    """What was taken from all positions, float64 [3]."""
+
+    def middle(self) -> np.ndarray:
+        """Return a point that half of the triangles lie before along each axis, float64 [3], at time 0."""
+        boxes: dict[int, np.ndarray] = {}
+        places, counts = [], []
+        for node, matrix in zip(self.nodes, world_matrices(self.nodes, 0.0), strict=True):
+            for mesh in node.meshes:
+                if id(mesh) not in boxes:
+                    used = mesh.indices[(mesh.indices >= 0) & (mesh.indices < len(mesh.points))]
+                    corners = np.asarray(mesh.points)[used]
+                    corners = corners[np.isfinite(corners).all(axis=1)]
+                    boxes[id(mesh)] = np.array([corners.min(axis=0), corners.max(axis=0)] if len(corners) else [])
+                if len(boxes[id(mesh)]):
+                    places.append(matrix[:3, :3] @ boxes[id(mesh)].mean(axis=0, dtype=np.float64) + matrix[:3, 3])
+                    counts.append(len(mesh.indices))
+        if not places:
+            return np.zeros(3)
+        order = np.argsort(places, axis=0, kind="stable")
+        sums = np.cumsum(np.array(counts)[order], axis=0)
+        return np.array([np.array(places)[order[np.searchsorted(s, s[-1] / 2), k], k] for k, s in enumerate(sums.T)])
+
+    def recentred(self, offset: np.ndarray) -> SceneParts:
+        """Return the parts with ``offset`` taken from all positions, in double precision."""
+        parents = {node.parent for node in self.nodes}
+        back = np.eye(4)
+        back[:3, 3] = -offset
+
+        def moved_node(index: int, node: Node) -> Node:
+            if node.parent is not None:
+                return node
+            is_bare = (
+                node.keyframes is None and index not in parents and np.array_equal(node.parent_from_node, np.eye(4))
+            )
+            if is_bare:  # its points may be doubles: they are moved before the cast
+                return replace(node, meshes=[replace(mesh, points=mesh.points - offset) for mesh in node.meshes])
+            keys = moved_keyframes(node.keyframes or (), -offset)
+            return replace(node, parent_from_node=back @ node.parent_from_node, keyframes=keys or None)
+
+        def moved_light(light: PunctualLight) -> PunctualLight:
+            return (
+                light if light.node is not None else replace(light, position=tuple(np.array(light.position) - offset))
+            )
+
+        return SceneParts(
+            [moved_node(index, node) for index, node in enumerate(self.nodes)],
+            [moved_light(light) for light in self.lights],
+            {name: camera.relative_to(offset) for name, camera in self.cameras.items()},
+            self.camera_nodes,
+            self.offset + offset,
+        )
+
+    def single(self) -> SceneParts:
+        """Return the parts with points in float32, as meshes have them; readers may give doubles."""
+        done: dict[int, Mesh] = {}
+        for mesh in (mesh for node in self.nodes for mesh in node.meshes):
+            if id(mesh) not in done:
+                single = np.asarray(mesh.points).dtype == np.float32
+                done[id(mesh)] = mesh if single else replace(mesh, points=np.asarray(mesh.points, np.float32))
+        nodes = [replace(node, meshes=[done[id(mesh)] for mesh in node.meshes]) for node in self.nodes]
+        return replace(self, nodes=nodes)
 
     def scaled(self, scale: float) -> SceneParts:
         """Return the parts with all lengths times ``scale``; intensities stay as they are."""
@@ -38,13 +101,15 @@ class SceneParts:
             return replace(light, position=position, range=None if light.range is None else scale * light.range)
 
         def scaled_camera(camera: Camera) -> Camera:
-            return replace(camera, world_from_camera=grow @ camera.world_from_camera)
+            offset = tuple(scale * np.array(camera.offset))
+            return replace(camera, world_from_camera=grow @ camera.world_from_camera, offset=offset)
 
         return SceneParts(
             [scaled_node(node) for node in self.nodes],
             [scaled_light(light) for light in self.lights],
             {name: scaled_camera(camera) for name, camera in self.cameras.items()},
             self.camera_nodes,
+            scale * self.offset,
         )
 
     def smoothed(self, angle: float) -> SceneParts:
@@ -57,4 +122,4 @@ class SceneParts:
             return done[id(mesh)]
 
         nodes = [replace(node, meshes=[smoothed_mesh(mesh) for mesh in node.meshes]) for node in self.nodes]
-        return SceneParts(nodes, self.lights, self.cameras, self.camera_nodes)
+        return replace(self, nodes=nodes)

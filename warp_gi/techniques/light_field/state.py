@@ -325,6 +325,7 @@ class ProbeState:
             "grid_spacing": self.grid.spacing,
             "grid_counts": np.array(self.grid.counts, np.int32),
             "bounds": scene.bounds,
+            **({"offset": scene.offset} if scene.offset.any() else {}),
             "sky": sky_bytes(scene),
             "cameras": camera_rows(cameras_of(self.camera, every=True) or list(scene.cameras.values())),
         }
