@@ -12,6 +12,7 @@ class FrameSums:
     environment: wp.array(dtype=wp.vec3)
     emitters: wp.array(dtype=wp.vec3)
     indirect: wp.array(dtype=wp.vec3)
+    alpha: wp.array(dtype=wp.float32)  # over camera samples
     albedo: wp.array(dtype=wp.vec3)
     normal: wp.array(dtype=wp.vec3)
     moment1: wp.array(dtype=wp.vec3)
@@ -54,6 +55,7 @@ def compose_frame(first: wp.int32, camera_samples: wp.int32, samples: wp.int32, 
     b.environment[i] = environment
     b.emitters[i] = emitters
     b.indirect[i] = indirect
+    b.alpha[i] = b.alpha[i] / views
     b.albedo[i] = b.albedo[i] / views
     b.normal[i] = b.normal[i] / views
     if b.guide_diffuse.shape[0] > 0:

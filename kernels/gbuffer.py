@@ -14,13 +14,15 @@ wp.set_module_options({"enable_backward": False})
 TILE = 8  # pixels; items run through square tiles, so that neighbours in time are neighbours in the picture
 
 
-# `right` and `up` are scaled so that forward + x right + y up with x, y in [-1, 1] spans the picture.
+# `right` and `up` are scaled so that forward + x right + y up with x, y in [-1, 1] spans the picture, once `center` is
+# added to x and y: where its middle is on that plane. It is zero without a lens shift.
 @wp.struct
 class CameraData:
     position: wp.vec3
     right: wp.vec3
     up: wp.vec3
     forward: wp.vec3
+    center: wp.vec2
     width: wp.int32
     height: wp.int32
 
@@ -52,6 +54,7 @@ class PassSettings:
 @wp.struct
 class SurfaceBuffers:
     emission: wp.array(dtype=wp.vec3)
+    alpha: wp.array(dtype=wp.float32)  # number of samples that hit
     albedo: wp.array(dtype=wp.vec3)
     normal: wp.array(dtype=wp.vec3)
     position: wp.array(dtype=wp.vec3)  # this and the following: of the first camera sample
@@ -83,8 +86,8 @@ def tiled_pixel(item: wp.int32, width: wp.int32) -> wp.vec2i:
 
 @wp.func
 def camera_ray(camera: CameraData, x: wp.float32, y: wp.float32) -> wp.vec3:
-    sx = 2.0 * x / wp.float32(camera.width) - 1.0
-    sy = 1.0 - 2.0 * y / wp.float32(camera.height)
+    sx = 2.0 * x / wp.float32(camera.width) - 1.0 + camera.center[0]
+    sy = 1.0 - 2.0 * y / wp.float32(camera.height) + camera.center[1]
     return wp.normalize(camera.forward + camera.right * sx + camera.up * sy)
 
 
@@ -92,8 +95,8 @@ def camera_ray(camera: CameraData, x: wp.float32, y: wp.float32) -> wp.vec3:
 @wp.func
 def project(camera: CameraData, direction: wp.vec3) -> wp.vec2:
     z = wp.max(wp.dot(direction, camera.forward), 1.0e-9)
-    x = wp.dot(direction, camera.right) / (wp.length_sq(camera.right) * z)
-    y = wp.dot(direction, camera.up) / (wp.length_sq(camera.up) * z)
+    x = wp.dot(direction, camera.right) / (wp.length_sq(camera.right) * z) - camera.center[0]
+    y = wp.dot(direction, camera.up) / (wp.length_sq(camera.up) * z) - camera.center[1]
     return wp.vec2(0.5 * (x + 1.0) * wp.float32(camera.width), 0.5 * (1.0 - y) * wp.float32(camera.height))
 
 
@@ -158,7 +161,7 @@ def add_guides(
         buffers.guide_object[pixel] = object_id + 1
 
 
-# Thread: a pixel. Adds what the first hit shows: emission, albedo, normal; the first camera
+# Thread: a pixel. Adds what the first hit shows: emission, coverage, albedo, normal; the first camera
 # sample sets position, depth (along the view axis, inf on a miss), ids, and motion: where the
 # point was in the previous frame, minus where it is now, in pixels, x right and y down.
 @wp.kernel
@@ -186,6 +189,7 @@ def shade_primary(
     else:
         s = surface_at(scene, face, u, v, -direction)
         buffers.emission[pixel] = buffers.emission[pixel] + surface_emission(scene, face, u, v, -direction)
+        buffers.alpha[pixel] = buffers.alpha[pixel] + 1.0
         buffers.albedo[pixel] = buffers.albedo[pixel] + s.base_color
         buffers.normal[pixel] = buffers.normal[pixel] + shading_normal(s)
         was = previous_position(scene.geometry, face, u, v)

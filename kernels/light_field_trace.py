@@ -91,6 +91,7 @@ class ProbeBuffers:
 @wp.struct
 class ProbeView:
     emission: wp.array(dtype=wp.vec3)
+    alpha: wp.array(dtype=wp.float32)  # number of samples that hit
     indirect: wp.array(dtype=wp.vec3)
     normal: wp.array(dtype=wp.vec3)
     position: wp.array(dtype=wp.vec3)  # this and the next three: of the first camera sample alone
@@ -364,6 +365,7 @@ def view_probes(first: wp.int32, camera: CameraData, settings: PassSettings, fie
             emitted = texel_emission(field, texel)
             position = camera.position + direction * hit.t
             depth = wp.dot(position - camera.position, camera.forward)
+            view.alpha[pixel] = view.alpha[pixel] + 1.0
             view.normal[pixel] = view.normal[pixel] + surfel_normal(surfel)
         elif surfel_distance(surfel) >= NOTHING:
             emitted = unpack_radiance(field.radiance[texel])

@@ -230,7 +230,7 @@ class SpatioTemporal(Denoiser):
         frame.launch(denoise.put_back, [light, guides, filtered, frame["beauty"]])
         edges = self._edges(frame)
         if edges.samples > 0:
-            inputs = [frame.data, frame.camera_data, settings, edges, guides, filtered, frame["beauty"]]
+            inputs = [frame.seen_data, frame.camera_data, settings, edges, guides, filtered, frame["beauty"]]
             frame.launch_tiled(denoise_edges.sample_edges, inputs)
         if has_history and state.picture is not None:
             picture = wp.clone(frame["beauty"])
@@ -288,7 +288,7 @@ class SpatioTemporal(Denoiser):
     def _settings(self, frame: Frame) -> denoise.DenoiseSettings:
         settings = denoise.DenoiseSettings()
         settings.width, settings.height = frame.camera.resolution
-        settings.footprint = 2.0 * math.tan(math.radians(frame.camera.hfov) / 2) / settings.width
+        settings.footprint = frame.camera.footprint
         settings.diffuse_frames, settings.glossy_frames = self.frames, self.glossy_frames
         settings.worth = frame.settings.spp / frame.pipeline_samples
         settings.settled = LONG - 1.0 + max(1.0, self.first_samples / frame.pipeline_samples)

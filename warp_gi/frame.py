@@ -28,6 +28,7 @@ TERMS = ("environment", "emitters", "indirect")
 _VEC3_BUFFERS = ("beauty", "emission", *TERMS, "albedo", "normal", "position", "variance", "moment1", "moment2")
 BUFFERS = (
     "beauty",
+    "alpha",
     "emission",
     *TERMS,
     "albedo",
@@ -39,7 +40,8 @@ BUFFERS = (
     "material_id",
     "variance",
 )
-"""Names of a frame's buffers: radiance in W/(m^2 sr), lengths in m, motion in pixels, ids -1 for "nothing"."""
+"""Names of a frame's buffers: radiance in W/(m^2 sr), alpha the share of camera samples that hit, lengths in m, motion
+in pixels, ids -1 for "nothing"."""
 
 Offer = TypeVar("Offer")
 
@@ -54,6 +56,8 @@ class FrameSettings:
     """Number of camera rays a pixel that the samples are spread over."""
     filter: str = "box"
     """Pixel filter, "box" or "tent"."""
+    background: bool = True
+    """Whether pictures show the sky where a camera ray hits nothing."""
     wants_lobes: bool = False
     """Whether a denoiser reads guides and the light of each lobe (``Frame.lobes``)."""
 
@@ -79,6 +83,10 @@ class Frame:
         previous_index: int,
     ) -> None:
         self.scene, self.data, self.settings, self.device = scene, data, settings, device
+        self.seen_data = data if settings.background else launch.copied(data, types.SceneData)
+        """The scene as camera rays see it: without its sky, if pictures have no background."""
+        if not settings.background:
+            self.seen_data.environment = types.Environment()
         self.camera, self.previous_camera = camera, previous_camera
         self.index, self.previous_index = index, previous_index
         self.time = frame_time
@@ -108,6 +116,7 @@ class Frame:
 
         self._arrays: dict[str, wp.array] = {name: zeros(wp.vec3) for name in _VEC3_BUFFERS}
         self._arrays |= {
+            "alpha": zeros(wp.float32),
             "depth": zeros(wp.float32),
             "motion": zeros(wp.vec2),
             "object_id": zeros(wp.int32),

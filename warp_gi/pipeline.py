@@ -57,6 +57,9 @@ class Pipeline:
     less. 1 gives pixel centres, spp one a sample as a reference wants."""
     filter: str = "box"
     """Pixel filter: "box" or "tent" (two pixels wide)."""
+    background: bool = True
+    """Whether the beauty shows the sky where the camera sees no surface. Without it, and with the channel A, a picture
+    can be laid over another one; the sky lights surfaces all the same."""
     denoise: Denoiser | None = None
     """Denoiser that makes the beauty of the noisy terms, or its name: "spatiotemporal", "oidn". The terms stay
     noisy."""
@@ -96,6 +99,8 @@ class Pipeline:
                 f"{type(whole[0]).__name__} finds primary hits itself, and holds all light that they send; leave the "
                 'other terms and the denoiser out, as the preset "probe_view" does'
             )
+        if whole and not self.background:
+            raise OptionError(f"{type(whole[0]).__name__} always shows the sky of its bake; leave background=False out")
 
     # ---- parts ----
 
@@ -195,7 +200,7 @@ class Pipeline:
     def frame_settings(self) -> FrameSettings:
         """Settings that decide how a frame is sampled."""
         wants_lobes = self.denoise is not None and self.denoise.wants_lobes
-        return FrameSettings(self.spp, self.camera_sample_count, self.filter, wants_lobes)
+        return FrameSettings(self.spp, self.camera_sample_count, self.filter, self.background, wants_lobes)
 
     def describe(self) -> dict[str, Any]:
         """Return all settings by dotted name, e.g. {"indirect": "BsdfPaths", "indirect.max_depth": 64, ...}."""

@@ -33,4 +33,4 @@ class CameraRays(Primary):
         settings, cameras = frame.pass_settings, [frame.camera_data, frame.previous_camera_data]
         frame.launch_tiled(gbuffer.trace_primary, [frame.data, frame.camera_data, settings, frame.hits])
         buffers = frame.struct(gbuffer.SurfaceBuffers)
-        frame.launch(gbuffer.shade_primary, [frame.data, *cameras, settings, frame.hits, buffers])
+        frame.launch(gbuffer.shade_primary, [frame.seen_data, *cameras, settings, frame.hits, buffers])

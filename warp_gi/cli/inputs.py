@@ -52,13 +52,16 @@ class SceneOptions:
     """Factor on the sky's radiance."""
     sun: SunSky = field(default_factory=SunSky)
     camera: Annotated[str, flag("PATH", "the built-in path, the file's first camera, or one that sees all")] = ""
-    """Camera path in JSON, name of a camera in the scene, or name of a built-in scene whose path to take."""
+    """Camera path in JSON, a transforms.json of nerfstudio, name of a camera in the scene, or name of a built-in scene
+    whose path to take."""
     eye: Annotated[tuple[float, float, float] | None, flag("X Y Z", "use --camera")] = None
     """Position of a still camera in metres."""
     target: Annotated[tuple[float, float, float] | None, flag("X Y Z", "use --camera")] = None
     """Point in metres that a still camera looks at."""
     hfov: Annotated[float | None, flag("DEGREES", "the camera's own; 65 with --eye")] = None
     """Horizontal field of view of a still camera in degrees."""
+    vfov: Annotated[float | None, flag("DEGREES", "as --hfov and the resolution say")] = None
+    """Vertical field of view of a still camera in degrees, in place of --hfov."""
 
 
 def open_scene(name: str, smooth: float | None = None, scale: float = 1.0, recentre: bool | None = None) -> Scene:
@@ -126,7 +129,14 @@ def move_sky(scene: Scene, turn: float, camera: Camera | CameraPath, frames: Ite
 
 def find_camera(options: SceneOptions, scene: Scene | BakedScene, report: Reporter) -> Camera | CameraPath:
     """Return the camera or path that was asked for, counted from where the scene's positions are."""
-    return _find_camera(options, scene, report).relative_to(scene.offset)
+    camera = _find_camera(options, scene, report)
+    if options.vfov is not None:
+        if options.hfov is not None:
+            raise OptionError("--hfov and --vfov exclude each other; give one")
+        if isinstance(camera, CameraPath):
+            raise OptionError("--vfov goes with a still camera; a camera path has its own field of view")
+        camera = camera.with_vfov(options.vfov)
+    return camera.relative_to(scene.offset)
 
 
 def _find_camera(options: SceneOptions, scene: Scene | BakedScene, report: Reporter) -> Camera | CameraPath:
@@ -161,7 +171,7 @@ def _find_camera(options: SceneOptions, scene: Scene | BakedScene, report: Repor
     if options.hfov is not None:
         if isinstance(camera, CameraPath):
             raise OptionError("--hfov goes with a still camera; a camera path has its own field of view")
-        camera = replace(camera, hfov=options.hfov)
+        camera = replace(camera, hfov=options.hfov, keeps_vfov=False)
     return camera
 
 

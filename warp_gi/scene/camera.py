@@ -39,11 +39,17 @@ class CameraKey:
     """Direction that is up in the picture, of any length."""
     hfov: float = 65.0
     """Horizontal field of view in degrees."""
+    lens_shift: tuple[float, float] = (0.0, 0.0)
+    """By how much the middle of the picture is right of the view axis, in widths, and above it, in heights."""
+    pixel_aspect: float = 1.0
+    """Width of a pixel by its height."""
+    keeps_vfov: bool = False
+    """Whether the vertical field of view, and not the horizontal one, stays at another resolution."""
 
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Keyframes in time; eye, target, up and field of view follow cubic Hermite curves through the keys.
+    """Keyframes in time; eye, target, up and lens follow cubic Hermite curves through the keys.
 
     Raises OptionError without keys, or with times that do not rise.
     """
@@ -82,10 +88,14 @@ class CameraPath:
 
     def camera_at(self, time: float) -> Camera:
         """Return the camera at a time in seconds, held before the first and after the last key."""
-        rows = np.array([[*k.eye, *k.target, *k.up, k.hfov] for k in self.keys], dtype=np.float64)
+        lenses = ([k.hfov, *k.lens_shift, k.pixel_aspect] for k in self.keys)
+        rows = np.array(
+            [[*k.eye, *k.target, *k.up, *lens] for k, lens in zip(self.keys, lenses, strict=True)], np.float64
+        )
         pose = _hermite(np.array([k.time for k in self.keys]), rows, time)
         camera = Camera.look_at(pose[0:3], pose[3:6], pose[6:9], float(pose[9]), self.resolution, self.name)
-        return replace(camera, offset=self.offset)
+        right, above, pixel_aspect = pose[10:].tolist()
+        return replace(camera, offset=self.offset, lens_shift=(right, above), pixel_aspect=pixel_aspect)
 
     def relative_to(self, offset: Sequence[float] | np.ndarray) -> CameraPath:
         """Return the same path, counted from another point of the file's coordinates (as of ``Scene.offset``)."""
@@ -96,8 +106,14 @@ class CameraPath:
         return replace(self, keys=tuple(keys), offset=_three(offset))
 
     def at_resolution(self, width: int, height: int) -> CameraPath:
-        """Return the same path with another resolution."""
-        return replace(self, resolution=(width, height))
+        """Return the same path with another resolution; fields of view stay as ``CameraKey.keeps_vfov`` says."""
+        wider = (width / height) / (self.resolution[0] / self.resolution[1])
+
+        def fitted(key: CameraKey) -> CameraKey:
+            half = math.tan(math.radians(key.hfov) / 2) * wider
+            return replace(key, hfov=2 * math.degrees(math.atan(half))) if key.keeps_vfov else key
+
+        return replace(self, keys=tuple(fitted(key) for key in self.keys), resolution=(width, height))
 
     @classmethod
     def still(cls, camera: Camera) -> CameraPath:
@@ -116,7 +132,8 @@ class CameraPath:
         for camera, time in zip(cameras, times, strict=True):
             matrix = camera.relative_to(offset).world_from_camera
             target = matrix[:3, 3] - matrix[:3, 2]
-            keys.append(CameraKey(time, tuple(matrix[:3, 3]), tuple(target), tuple(matrix[:3, 1]), camera.hfov))
+            lens = camera.hfov, camera.lens_shift, camera.pixel_aspect, camera.keeps_vfov
+            keys.append(CameraKey(time, _three(matrix[:3, 3]), _three(target), _three(matrix[:3, 1]), *lens))
         return cls(tuple(keys), fps, cameras[0].resolution if cameras else (960, 540), offset=offset)
 
     @classmethod
@@ -175,45 +192,36 @@ class CameraPath:
 
     @classmethod
     def load(cls, path: str | Path) -> CameraPath:
-        """Read a path from JSON, as ``save`` writes it.
+        """Read a path from JSON, as ``save`` writes it, or the cameras of a ``transforms.json``, one a frame.
 
         ``{"fps": 24, "resolution": [960, 540], "keyframes": [{"time": 0, "eye": [x, y, z],
-        "target": [x, y, z], "up": [0, 1, 0], "hfov": 65}, ...]}``; up, hfov, fps and resolution may be left out.
+        "target": [x, y, z], "up": [0, 1, 0], "hfov": 65}, ...]}``; up, hfov, fps and resolution may be left out. A
+        keyframe may have "vfov" in place of hfov, "lens_shift" and "pixel_aspect"; or "K", which needs the resolution.
+        In place of eye and target it may have "world_from_camera" and "convention", as ``Camera.from_intrinsics``.
         Raises SceneError when the file is missing or not such a path.
         """
-        try:
-            document = json.loads(Path(path).read_text(encoding="utf-8"))
-        except OSError as error:
-            raise SceneError(f"camera path {path}: {error.strerror}; give a JSON file with keyframes") from error
-        except ValueError as error:
-            raise SceneError(f"camera path {path}: not JSON ({error})") from error
-        try:
-            keys = [
-                CameraKey(
-                    float(key.get("time", 0.0)),
-                    _three(key["eye"]),
-                    _three(key["target"]),
-                    _three(key.get("up", (0, 1, 0))),
-                    float(key.get("hfov", 65.0)),
-                )
-                for key in document["keyframes"]
-            ]
-            fps = float(document.get("fps", 24.0))
-            width, height = (int(size) for size in document.get("resolution", (960, 540)))
-            result = cls(tuple(keys), fps, (width, height), name=Path(path).stem)
-            result.camera_at(0.0)
-        except KeyError as error:
-            raise SceneError(f"camera path {path}: {error} is missing from the path or from a keyframe") from error
-        except (TypeError, ValueError, AttributeError) as error:
-            raise SceneError(f"camera path {path}: {error}") from error
-        return result
+        from warp_gi.scene.camera_files import read_camera_path
+
+        return read_camera_path(Path(path))
 
     def save(self, path: str | Path) -> None:
-        """Write the path as JSON."""
-        keys = [
-            {"time": k.time, "eye": list(k.eye), "target": list(k.target), "up": list(k.up), "hfov": k.hfov}
-            for k in self.keys
-        ]
+        """Write the path as JSON, in the file's coordinates."""
+        keys: list[dict[str, object]] = []
+        for k in self.relative_to((0.0, 0.0, 0.0)).keys:
+            key: dict[str, object] = {
+                "time": k.time,
+                "eye": list(k.eye),
+                "target": list(k.target),
+                "up": list(k.up),
+                "hfov": k.hfov,
+            }
+            if k.lens_shift != (0.0, 0.0) or k.pixel_aspect != 1.0:
+                key |= {"lens_shift": list(k.lens_shift), "pixel_aspect": k.pixel_aspect}
+            if k.keeps_vfov:
+                lens = Camera(np.eye(4), k.hfov, self.resolution, pixel_aspect=k.pixel_aspect)
+                key["vfov"] = lens.vfov
+                del key["hfov"]
+            keys.append(key)
         document = {"fps": self.fps, "resolution": list(self.resolution), "keyframes": keys}
         Path(path).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 

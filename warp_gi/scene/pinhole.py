@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import warp as wp
 
-from warp_gi.errors import OptionError
+from warp_gi.errors import OptionError, unknown_name
 from warp_gi.kernels import gbuffer
 
 Vector = Sequence[float] | np.ndarray
 """Three numbers, for a position or a direction."""
 
+CONVENTIONS = {"opencv": (1.0, -1.0, -1.0, 1.0), "opengl": (1.0, 1.0, 1.0, 1.0)}
+"""Factors on the axes of a camera's space that make it x right, y up, z backward."""
 LARGEST_SIDE = 1 << 16  # pixels; their Morton code has 16 bits an axis
 LARGEST_COUNT = 1 << 30  # pixels; kernels count them in int32
 
@@ -23,8 +26,8 @@ LARGEST_COUNT = 1 << 30  # pixels; kernels count them in int32
 class Camera:
     """A pinhole camera. It looks along -z of its own space, x is right and y up in the picture.
 
-    Raises OptionError for a field of view outside (0, 180) degrees, an empty
-    resolution, or a matrix that is singular or not finite.
+    It has no depth of field and no lens distortion. Raises OptionError for a field of view outside (0, 180) degrees,
+    an empty resolution, or a matrix that is singular, reflected or not finite.
     """
 
     world_from_camera: np.ndarray
@@ -35,6 +38,12 @@ class Camera:
     """Width and height in pixels."""
     name: str = ""
     """Name in messages and reports."""
+    lens_shift: tuple[float, float] = (0.0, 0.0)
+    """By how much the middle of the picture is right of the view axis, in widths, and above it, in heights."""
+    pixel_aspect: float = 1.0
+    """Width of a pixel by its height: the focal length in pixels downwards by that across."""
+    keeps_vfov: bool = False
+    """Whether the vertical field of view, and not the horizontal one, stays at another resolution."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Point in metres of a file's coordinates that ``world_from_camera`` counts from: that of a recentred scene."""
 
@@ -44,6 +53,11 @@ class Camera:
             raise OptionError(f"camera {self.name!r}: world_from_camera must be a finite 4x4 matrix, got {matrix}")
         if abs(np.linalg.det(matrix[:3, :3])) < 1e-12:
             raise OptionError(f"camera {self.name!r}: world_from_camera is singular; give three independent axes")
+        if np.linalg.det(matrix[:3, :3]) < 0:
+            raise OptionError(
+                f"camera {self.name!r}: world_from_camera is a reflection (its determinant is negative), which no"
+                " camera is; negate one of its axes, or say which convention it follows (Camera.from_intrinsics)"
+            )
         z = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
         y = matrix[:3, 1] - z * (matrix[:3, 1] @ z)
         y /= np.linalg.norm(y)
@@ -51,6 +65,10 @@ class Camera:
         object.__setattr__(self, "world_from_camera", matrix)
         if not 0.0 < self.hfov < 180.0:
             raise OptionError(f"camera {self.name!r}: hfov must be between 0 and 180 degrees, got {self.hfov}")
+        if not (self.pixel_aspect > 0 and math.isfinite(self.pixel_aspect)):
+            raise OptionError(f"camera {self.name!r}: pixel_aspect must be finite and above 0, got {self.pixel_aspect}")
+        if len(self.lens_shift) != 2 or not all(math.isfinite(shift) for shift in self.lens_shift):
+            raise OptionError(f"camera {self.name!r}: lens_shift must be two finite numbers, got {self.lens_shift}")
         try:
             width, height = (int(size) for size in self.resolution)
         except (TypeError, ValueError) as error:
@@ -72,16 +90,103 @@ class Camera:
         hfov: float = 65.0,
         resolution: tuple[int, int] = (960, 540),
         name: str = "",
+        *,
+        vfov: float | None = None,
+        lens_shift: tuple[float, float] = (0.0, 0.0),
     ) -> Camera:
         """Return a camera at ``eye`` [m] that looks at ``target`` [m].
 
+        ``vfov`` is the vertical field of view in degrees, in place of ``hfov``, and stays at another resolution.
         Raises OptionError if eye and target coincide or ``up`` is along the view.
         """
-        return cls(_look_at_matrix(eye, target, up), hfov, resolution, name)
+        camera = cls(_look_at_matrix(eye, target, up), hfov, resolution, name, lens_shift)
+        return camera if vfov is None else camera.with_vfov(vfov)
+
+    @classmethod
+    def from_intrinsics(
+        cls,
+        K: Sequence[Sequence[float]] | np.ndarray,
+        world_from_camera: Sequence[Sequence[float]] | np.ndarray,
+        resolution: tuple[int, int],
+        convention: Literal["opencv", "opengl"] = "opencv",
+        name: str = "",
+    ) -> Camera:
+        """Return a calibrated camera.
+
+        Args:
+            K: ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`` in pixels; (0, 0) is the top left corner of the picture, y goes
+                down (COLMAP, nerfstudio). Where (0, 0) is the middle of the first pixel (``cv2.calibrateCamera``), add
+                0.5 to cx and cy.
+            world_from_camera: Placement, [4, 4] or [3, 4], acting on column vectors; the inverse of "extrinsics".
+            resolution: Width and height in pixels that K is for.
+            convention: Axes of the camera's space: "opencv" is x right, y down, z forward, "opengl" x right, y up,
+                z backward, as in Blender and glTF.
+            name: Name in messages and reports.
+
+        Raises OptionError for a K of another form, a skewed one among them, an unknown convention, or a matrix that
+        cannot be a placement. Lens distortion is not modelled: undistort the pictures first.
+        """
+        matrix = np.array(K, np.float64)
+        form = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+        if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+            raise OptionError(f"camera {name!r}: K must be {form}, finite, got {np.asarray(K).tolist()}")
+        (fx, skew, cx), (low, fy, cy), last = matrix
+        if abs(skew) > 1e-9 * abs(fx) or low or not np.array_equal(last, (0.0, 0.0, 1.0)) or fx <= 0 or fy <= 0:
+            raise OptionError(f"camera {name!r}: K must be {form} with fx and fy above 0, got {matrix.tolist()}")
+        if convention not in CONVENTIONS:
+            raise unknown_name("camera convention", convention, CONVENTIONS)
+        placement = np.eye(4)
+        given = np.asarray(world_from_camera, np.float64)
+        if given.shape not in ((4, 4), (3, 4)):
+            raise OptionError(f"camera {name!r}: world_from_camera must be 4x4 or 3x4, got shape {given.shape}")
+        placement[: len(given)] = given
+        width, height = resolution
+        hfov = 2 * math.degrees(math.atan(0.5 * width / fx))
+        shift = (float(0.5 - cx / width), float(cy / height - 0.5))
+        axes = np.diag(CONVENTIONS[convention])
+        return cls(placement @ axes, hfov, resolution, name, shift, float(fy / fx))
+
+    def with_vfov(self, vfov: float) -> Camera:
+        """Return the same camera with a vertical field of view in degrees, which stays at another resolution."""
+        if not 0.0 < vfov < 180.0:
+            raise OptionError(f"camera {self.name!r}: vfov must be between 0 and 180 degrees, got {vfov}")
+        width, height = self.resolution
+        half = math.tan(math.radians(vfov) / 2) * self.pixel_aspect * width / height
+        return replace(self, hfov=2 * math.degrees(math.atan(half)), keeps_vfov=True)
 
     def at_resolution(self, width: int, height: int) -> Camera:
-        """Return the same camera with another resolution."""
-        return replace(self, resolution=(width, height))
+        """Return the same camera with another resolution; the field of view stays across, or down (``keeps_vfov``)."""
+        camera = replace(self, resolution=(width, height))
+        return camera.with_vfov(self.vfov) if self.keeps_vfov else camera
+
+    @property
+    def vfov(self) -> float:
+        """Vertical field of view in degrees."""
+        return 2 * math.degrees(math.atan(self._halves[1]))
+
+    @property
+    def intrinsics(self) -> np.ndarray:
+        """``K`` of ``from_intrinsics``, float64 [3, 3]: focal lengths and principal point in pixels."""
+        (width, height), (across, up), (right, above) = self.resolution, self._halves, self.lens_shift
+        fx, fy = 0.5 * width / across, 0.5 * height / up
+        return np.array([[fx, 0.0, (0.5 - right) * width], [0.0, fy, (0.5 + above) * height], [0.0, 0.0, 1.0]])
+
+    @property
+    def lens(self) -> tuple[object, ...]:
+        """All that decides a picture beside the placement, to compare cameras by."""
+        return self.hfov, self.resolution, self.lens_shift, self.pixel_aspect
+
+    @property
+    def footprint(self) -> float:
+        """Longer side of a pixel in metres, at 1 m along the view axis."""
+        return 2.0 * self._halves[0] / self.resolution[0] * max(1.0, 1.0 / self.pixel_aspect)
+
+    @property
+    def _halves(self) -> tuple[float, float]:
+        """Half the width and half the height of the picture at 1 m along the view axis, in metres."""
+        width, height = self.resolution
+        half = math.tan(math.radians(self.hfov) / 2)
+        return half, half * height / width / self.pixel_aspect
 
     def relative_to(self, offset: Vector) -> Camera:
         """Return the same camera, counted from another point of the file's coordinates (as of ``Scene.offset``)."""
@@ -98,19 +203,16 @@ class Camera:
 
     def directions(self, pixels: np.ndarray) -> np.ndarray:
         """Return unit vectors float64 [n, 3] from the camera through pixel coordinates [n, 2], as of ``project``."""
-        width, height = self.resolution
-        scale = 2 * math.tan(math.radians(self.hfov) / 2) / width
-        x, y = np.moveaxis((np.asarray(pixels, dtype=np.float64) - (0.5 * width, 0.5 * height)) * scale, -1, 0)
+        (fx, _, cx), (_, fy, cy), _ = self.intrinsics
+        x, y = np.moveaxis((np.asarray(pixels, dtype=np.float64) - (cx, cy)) / (fx, fy), -1, 0)
         ways = np.stack([x, -y, np.full_like(x, -1.0)], axis=-1) @ self.world_from_camera[:3, :3].T
         return ways / np.linalg.norm(ways, axis=-1, keepdims=True)
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Return pixel coordinates float64 [n, 2] of world ``points`` [n, 3]; (0, 0) is the top left corner."""
+        """Return pixel coordinates float64 [n, 2] of ``points`` [n, 3]; (0, 0) is the top left corner."""
         local = (np.asarray(points, dtype=np.float64) - self.position) @ self.world_from_camera[:3, :3]
-        width, height = self.resolution
-        scale = 0.5 * width / math.tan(math.radians(self.hfov) / 2)
-        xy = local[:, :2] / -local[:, 2:] * [scale, -scale]
-        return xy + np.array([0.5 * width, 0.5 * height])
+        (fx, _, cx), (_, fy, cy), _ = self.intrinsics
+        return local[:, :2] / -local[:, 2:] * [fx, -fy] + np.array([cx, cy])
 
 
 def offset_text(offset: Vector) -> str:
@@ -137,13 +239,14 @@ def _look_at_matrix(*given: Vector) -> np.ndarray:
 
 def camera_data(camera: Camera) -> gbuffer.CameraData:
     """Return the camera as kernels read it."""
-    width, height = camera.resolution
     right, up, back = camera.world_from_camera[:3, :3].T
+    width, height = camera.resolution
     half = math.tan(math.radians(camera.hfov) / 2)
     data = gbuffer.CameraData()
     data.position = wp.vec3(*camera.position)
     data.right = wp.vec3(*(right * half))
-    data.up = wp.vec3(*(up * half * height / width))
+    data.up = wp.vec3(*(up * half * height / width / camera.pixel_aspect))
     data.forward = wp.vec3(*-back)
+    data.center = wp.vec2(*(2.0 * shift for shift in camera.lens_shift))
     data.width, data.height = width, height
     return data

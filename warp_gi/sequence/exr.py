@@ -1,6 +1,6 @@
 """EXR files with named layers and metadata, through OpenImageIO.
 
-One part, scan lines, ZIP. Layers follow the usual names: ``R G B`` for the picture,
+One part, scan lines, ZIP. Layers follow the usual names: ``R G B`` for the picture, ``A`` for its coverage,
 ``N.X``, ``P.X``, ``Z``, ``motion.u``, ``albedo.R`` and so on. Colours and normals are
 half unless a value is past half's range; positions, depth, motion, identifiers and
 variance are float. No capture date is written, so equal frames are equal files.
@@ -23,6 +23,7 @@ Attribute = str | int | float | np.ndarray
 # buffer -> its channels in the file; other buffers are named after themselves
 _CHANNELS = {
     "beauty": ("R", "G", "B"),
+    "alpha": ("A",),
     "normal": ("N.X", "N.Y", "N.Z"),
     "position": ("P.X", "P.Y", "P.Z"),
     "depth": ("Z",),
@@ -32,6 +33,8 @@ _CHANNELS = {
 }
 _BUFFER_OF_CHANNEL = {channel: name for name, channels in _CHANNELS.items() for channel in channels}
 _ALWAYS_FLOAT = {"position", "depth", "motion", "object_id", "material_id", "variance"}
+_ARRAYS = {16: "matrix", 9: "matrix33", 2: "float[2]"}
+_SHAPES = {"matrix": (4, 4), "matrix33": (3, 3), "float2": (2,), "float[2]": (2,)}
 _INTEGER = {"object_id", "material_id"}
 
 
@@ -82,7 +85,7 @@ def write_exr(
 ) -> None:
     """Write ``buffers`` (each [height, width] or [height, width, 1 to 4]) and ``attributes`` to ``path``.
 
-    Attributes are text, numbers or 4x4 matrices (stored in row-vector convention as they are).
+    Attributes are text, numbers, 4x4 and 3x3 matrices (stored row after row as they are) or pairs of numbers.
     ``precision`` is "half" or "float" for the buffers that may be either.
     Raises OSError when the file cannot be written, OptionError for buffers of unequal size.
     """
@@ -115,7 +118,8 @@ def write_exr(
     spec.attribute("DateTime", "")  # without it the time of day goes into every file
     for name, value in attributes.items():
         if isinstance(value, np.ndarray):
-            spec.attribute(name, "matrix", tuple(float(v) for v in np.asarray(value).reshape(16)))
+            kind = oiio.TypeDesc(_ARRAYS[value.size])
+            spec.attribute(name, kind, tuple(float(v) for v in value.reshape(-1)))
         else:
             spec.attribute(name, plain(value))
     output = oiio.ImageOutput.create("exr")
@@ -134,7 +138,7 @@ def read_exr(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Attribu
 
     Buffers are float32 [height, width] or [height, width, channels], identifiers int32; a
     file by another program gives its layers by the same rules. Matrices come back as float32
-    [4, 4]. Raises SceneError when the file is missing, torn or not an EXR.
+    [4, 4] or [3, 3], pairs as [2]. Raises SceneError when the file is missing, torn or not an EXR.
     """
     import OpenImageIO as oiio
 
@@ -166,14 +170,12 @@ def read_exr(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Attribu
     attributes: dict[str, Attribute] = {}
     for item in spec.extra_attribs:
         value: Any = item.value
-        is_matrix = str(item.type) == "matrix"
-        attributes[item.name] = np.array(value, np.float32).reshape(4, 4) if is_matrix else value
+        shape = _SHAPES.get(str(item.type))
+        attributes[item.name] = value if shape is None else np.array(value, np.float32).reshape(shape)
     return buffers, attributes, {buffer: formats[indices[0]] for buffer, indices in groups.items()}
 
 
 def _buffer_of(channel: str) -> str:
     if channel in _BUFFER_OF_CHANNEL:
         return _BUFFER_OF_CHANNEL[channel]
-    if channel == "A":
-        return "alpha"
     return channel.rpartition(".")[0] or channel

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -130,18 +130,24 @@ def frame_attributes(
 ) -> dict[str, Attribute]:
     """Return the EXR attributes of a frame, all but its stage times.
 
-    ``worldToCamera`` and ``worldToNDC`` follow the OpenEXR standard: row vectors, a
-    left-handed camera space with x right, y up and z forward; NDC from (0, 0) at the upper
+    ``screenWindowCenter``, ``screenWindowWidth`` and ``pixelAspectRatio`` are OpenEXR's, at 1 m before the camera;
+    ``K`` is that of ``Camera.from_intrinsics``, row after row. ``worldToCamera`` and ``worldToNDC`` follow the OpenEXR
+    standard: row vectors, a left-handed camera space with x right, y up and z forward; NDC from (0, 0) at the upper
     left to (1, 1) at the lower right corner of the picture. ``warp_gi/offset`` is what a recentred scene's positions,
     and these matrices, are without: "x y z" in metres of the file's coordinates.
     """
     world_to_camera, world_to_ndc = camera_matrices(camera)
+    half_width, half_height = (math.tan(math.radians(angle) / 2) for angle in (camera.hfov, camera.vfov))
     attributes: dict[str, Attribute] = {
         "frame": int(index),
         "time": float(time),
         "hfov": float(camera.hfov),
         "worldToCamera": world_to_camera,
         "worldToNDC": world_to_ndc,
+        "K": camera.intrinsics,
+        "PixelAspectRatio": float(camera.pixel_aspect),
+        "screenWindowWidth": float(2 * half_width),
+        "screenWindowCenter": 2 * np.multiply(camera.lens_shift, (half_width, half_height)),
         PREFIX + "precision": precision,
     }
     if any(camera.offset):
@@ -158,12 +164,9 @@ def camera_matrices(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Return ``worldToCamera`` and ``worldToNDC`` as OpenEXR defines them, float32 [4, 4], for row vectors."""
     forward_z = np.diag([1.0, 1.0, -1.0, 1.0])
     camera_from_world = forward_z @ np.linalg.inv(camera.world_from_camera)
-    width, height = camera.resolution
-    scale = 0.5 / math.tan(math.radians(camera.hfov) / 2)
     # x / z and y / z on the picture; the third column only keeps the matrix invertible
-    ndc_from_camera = np.array(
-        [[scale, 0, 0.5, 0], [0, -scale * width / height, 0.5, 0], [0, 0, 1, -1], [0, 0, 1, 0]], np.float64
-    )
+    (x, _, right), (_, y, down), _ = camera.intrinsics / np.array([*camera.resolution, 1])[:, None]
+    ndc_from_camera = np.array([[x, 0, right, 0], [0, -y, down, 0], [0, 0, 1, -1], [0, 0, 1, 0]], np.float64)
     return camera_from_world.T.astype(np.float32), (ndc_from_camera @ camera_from_world).T.astype(np.float32)
 
 
@@ -217,6 +220,9 @@ def read_frame(path: str | Path) -> FrameFile:
         world_from_camera = np.linalg.inv(world_to_camera.astype(np.float64).T) @ np.diag([1.0, 1, -1, 1])
         x, y, z = (float(value) for value in str(metadata.get("offset", "0 0 0")).split())
         camera = Camera(world_from_camera, float(attributes["hfov"]), (width, height), offset=(x, y, z))
+        if isinstance(K := attributes.get("K"), np.ndarray):
+            shift = (0.5 - float(K[0, 2]) / width, float(K[1, 2]) / height - 0.5)
+            camera = replace(camera, lens_shift=shift, pixel_aspect=float(attributes["PixelAspectRatio"]))
     return FrameFile(
         buffers,
         formats,
@@ -251,7 +257,7 @@ def why_not_whole(
         have, want = frame.attributes.get(name), expected.get(name)
         if isinstance(want, np.ndarray):
             if have is None or not np.array_equal(have, want.astype(np.float32)):
-                return "another camera" if name.startswith("world") else "another frame before it"
+                return "another frame before it" if name.startswith("previous") else "another camera"
         elif want is None or have != plain(want):
             return f"{name.removeprefix(PREFIX)} is {have!r} instead of {None if want is None else plain(want)!r}"
     return None

@@ -9,6 +9,7 @@ of punctual lights are taken as radiometric numbers (W/sr, W/m^2) without conver
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 import pygltflib
 
-from warp_gi.errors import SceneError
+from warp_gi.errors import OptionError, SceneError
 from warp_gi.scene.animation import moving_nodes, pose_matrix, world_matrices
 from warp_gi.scene.files.gltf_animation import read_keyframes
 from warp_gi.scene.files.gltf_buffers import Buffers, split_glb
@@ -133,7 +134,11 @@ class _Reader:
                 name = self.document.cameras[source.camera].name or nodes[index].name
                 name = _unique(name, set(parts.cameras))
                 resolution = (max(1, round(CAMERA_HEIGHT * aspect)), CAMERA_HEIGHT)
-                parts.cameras[name] = Camera(world[index], hfov, resolution, name)
+                try:
+                    parts.cameras[name] = Camera(world[index], hfov, resolution, name)
+                except OptionError as error:
+                    warnings.warn(f"{str(self.path)!r}: {error}; it is left out", stacklevel=2)
+                    continue
                 parts.camera_nodes[name] = index
         return parts
 

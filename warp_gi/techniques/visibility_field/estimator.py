@@ -262,7 +262,7 @@ class VisibilityField(Estimator):
     def _relight_key(self, frame: Frame, state: FieldState) -> tuple[object, ...]:
         poses = b"".join(pose.tobytes() for pose in state.poses or ())
         camera = frame.camera
-        return camera.world_from_camera.tobytes(), camera.hfov, camera.resolution, poses, len(state.cells)
+        return camera.world_from_camera.tobytes(), camera.lens, poses, len(state.cells)
 
 
 def _is_black(scene: Scene | BakedScene) -> bool:

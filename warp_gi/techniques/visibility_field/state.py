@@ -380,6 +380,6 @@ def distinct_views(frames: Iterable[tuple[int, Camera]]) -> list[tuple[Camera, s
     """Return the cameras of frames, equal ones once, with the corners that those frames look through."""
     views: dict[bytes, tuple[Camera, set[int]]] = {}
     for index, view in frames:
-        key = view.world_from_camera.tobytes() + repr((view.hfov, view.resolution)).encode()
+        key = view.world_from_camera.tobytes() + repr(view.lens).encode()
         views.setdefault(key, (view, set()))[1].update(corners_of(index))
     return list(views.values())
