@@ -20,7 +20,7 @@ import numpy as np
 
 from warp_gi import __version__
 from warp_gi.errors import BakeError
-from warp_gi.files import replacing
+from warp_gi.files import replacing, user_path
 
 Setting = str | int | float
 """Value of a setting in a bake; bool is an int."""
@@ -134,7 +134,7 @@ def load_bake(path: str | Path) -> Bake:
     """
     from safetensors import SafetensorError, safe_open
 
-    path = Path(path)
+    path = user_path(path)
     if not path.exists():
         raise BakeError(f"{path}: no such file; bake first, or correct the path")
     if not path.is_file():

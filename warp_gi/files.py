@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 import shutil
@@ -13,6 +14,35 @@ from pathlib import Path
 from warp_gi.errors import OptionError
 
 
+def user_path(path: str | os.PathLike[str]) -> Path:
+    """Return a path whose ``~`` or ``~name`` is the home of the user; of an unknown user it stays as it is."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:
+        return Path(path)
+
+
+def check_target(path: Path) -> None:
+    """Raise OSError for a file that cannot be written: a folder, a read-only file, or in a folder that takes none.
+
+    Nothing is made or changed, so that it can be asked before the work starts.
+    """
+    if path.is_dir():
+        raise OSError(errno.EISDIR, "is a folder; name a file in it", str(path))
+    check_replaceable(path)
+    folder = next(parent for parent in path.absolute().parents if parent.exists())
+    if not folder.is_dir():
+        raise OSError(errno.ENOTDIR, "is a file, expected a folder; give another one", str(folder))
+    if not os.access(folder, os.W_OK):
+        raise OSError(errno.EACCES, "nothing can be written to this folder; give another one", str(folder))
+
+
+def check_replaceable(path: Path) -> None:
+    """Raise OSError for a file that is there and read-only: renaming another one to it would not ask."""
+    if path.is_file() and (not path.stat().st_mode & 0o222 or not os.access(path, os.W_OK)):
+        raise OSError(errno.EACCES, "is read-only; give another name, or make it writable", str(path))
+
+
 @contextlib.contextmanager
 def replacing(path: str | Path, own_folder: bool = False) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` to write to; it is renamed to ``path`` if the block succeeds.
@@ -20,9 +50,10 @@ def replacing(path: str | Path, own_folder: bool = False) -> Iterator[Path]:
     A file at ``path`` stays until the new one is complete and on disk. When the block
     raises, the temporary file is removed. Missing folders are made. ``own_folder`` puts the temporary file in a
     folder of its own, for a writer that makes files beside it: if the process is killed, they are found with it.
-    Raises OSError when the folder cannot be written to.
+    Raises OSError when the folder cannot be written to, or a file at ``path`` is read-only.
     """
-    path = Path(path)
+    path = user_path(path)
+    check_replaceable(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     if own_folder:
@@ -79,7 +110,7 @@ def frame_path(pattern: str | Path, index: int) -> Path:
     """
     if index < 0:
         raise OptionError(f"frame numbers start at 0, got {index}")
-    pattern = Path(pattern)
+    pattern = user_path(pattern)
     runs = list(re.finditer("#+", pattern.name))
     if not runs:
         return pattern
@@ -89,7 +120,7 @@ def frame_path(pattern: str | Path, index: int) -> Path:
 
 def frames_there(pattern: str | Path) -> list[int]:
     """Return the numbers, in order, for which ``frame_path`` names a file that is there."""
-    pattern = Path(pattern)
+    pattern = user_path(pattern)
     runs = list(re.finditer("#+", pattern.name))
     if not runs or not pattern.parent.is_dir():
         return []

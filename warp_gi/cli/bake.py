@@ -25,7 +25,7 @@ from warp_gi.cli.inputs import (
 from warp_gi.cli.options import flag, parse_options, value_given
 from warp_gi.cli.report import Reporter, run_command
 from warp_gi.errors import OptionError
-from warp_gi.files import check_writable, remove_stale_parts
+from warp_gi.files import check_target, check_writable, remove_stale_parts
 from warp_gi.rendering import bake
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.scene import Scene
@@ -168,6 +168,8 @@ def run(options: BakeOptions, report: Reporter) -> None:
     if options.view is not None:
         tool.check_view(options.settings, options.view)
     resolution = parse_resolution(options.picture) if options.picture else None
+    files = [output, *(tool.exported_files(options.export) if options.export else ()), *filter(None, [options.view])]
+    check_files(options, files)
     with report.phase("scene"):
         scene = find_scene(options)
         shows = options.show is not None or options.view is not None
@@ -177,8 +179,6 @@ def run(options: BakeOptions, report: Reporter) -> None:
         camera = camera.at_resolution(*resolution)
     report.line(f"{scene.name}: {scene.triangle_count:,} triangles")
     tool.check_scene(options.settings, scene)
-    files = [output, *(tool.exported_files(options.export) if options.export else ()), *filter(None, [options.view])]
-    check_files(options, files)
     folders = [output.parent, options.show, *(file and file.parent for file in (options.export, options.view))]
     for folder in filter(None, folders):
         check_writable(folder)
@@ -222,11 +222,10 @@ def run(options: BakeOptions, report: Reporter) -> None:
 
 
 def check_files(options: BakeOptions, files: Sequence[Path]) -> None:
-    """Raise OptionError for files to write that are folders, or that are read."""
+    """Raise OptionError for files to write that are read, OSError for those that cannot be written."""
     read = {name: Path(name) for name in (options.scene, options.environment, options.camera) if Path(name).is_file()}
     for file in files:
-        if file.is_dir():
-            raise OptionError(f"{file}: is a folder; name a file in it")
+        check_target(file)
         for name, path in read.items():
             if file.exists() and file.samefile(path):
                 raise OptionError(f"{file} would be written over {name}, which is read: give another name")

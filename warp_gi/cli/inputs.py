@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
@@ -39,6 +39,8 @@ class SceneOptions:
     """Crease angle in degrees: meshes of a file without normals get smooth ones, except across edges that bend more."""
     scale: float = 1.0
     """Length in metres of one unit of the file."""
+    up: Literal["x", "y", "z"] = "y"
+    """Axis of the file that points up; it becomes y, and cameras are given in the turned coordinates."""
     recentre: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Take the middle of the scene from all positions, in double precision. That is done without being asked where
     float32 has steps of more than a millimetre. Cameras stay in the file's coordinates; frames say what was taken."""
@@ -64,20 +66,27 @@ class SceneOptions:
     """Vertical field of view of a still camera in degrees, in place of --hfov."""
 
 
-def open_scene(name: str, smooth: float | None = None, scale: float = 1.0, recentre: bool | None = None) -> Scene:
+def open_scene(
+    name: str,
+    smooth: float | None = None,
+    scale: float = 1.0,
+    recentre: bool | None = None,
+    up: Literal["x", "y", "z"] = "y",
+) -> Scene:
     """Return a built-in scene by name, or one from a file (the other arguments are those of ``load_scene``)."""
     if name in BUILTIN_SCENES and not Path(name).is_file():
-        if smooth is not None or scale != 1.0 or recentre:
-            raise OptionError(f"--smooth, --scale and --recentre go with a scene from a file; {name} is built in")
+        if smooth is not None or scale != 1.0 or recentre or up != "y":
+            raise OptionError(f"--smooth, --scale, --up and --recentre go with a scene from a file; {name} is built in")
         return builtin_scene(name)
     if not Path(name).suffix and not Path(name).exists():
         raise unknown_name("scene", name, BUILTIN_SCENES)
-    return load_scene(name, smooth=smooth, scale=scale, recentre=recentre)
+    return load_scene(name, smooth=smooth, scale=scale, recentre=recentre, up=up)
 
 
 def find_scene(options: SceneOptions) -> Scene:
     """Return the scene that was asked for, with its sky."""
-    scene = open_scene(options.scene or DEFAULT_SCENE, options.smooth, options.scale, options.recentre or None)
+    name = options.scene or DEFAULT_SCENE
+    scene = open_scene(name, options.smooth, options.scale, options.recentre or None, options.up)
     if options.sun != SunSky() and options.environment != "sun-sky":
         raise OptionError("--sun.elevation and other --sun flags go with --environment sun-sky; give that too")
     if options.environment:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import itertools
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import tyro
 
 from warp_gi.errors import OptionError
+from warp_gi.files import user_path
 
 Options = TypeVar("Options")
 
@@ -56,15 +59,41 @@ def parse_options(
     ``description`` None is the docstring of the class. Raises OptionError for options that are unknown, missing or
     cannot be read.
     """
+    _check_empty(arguments)
     settings: dict[str, Any] = {} if default is None else {"default": default, "config": (tyro.conf.AvoidSubcommands,)}
     report = io.StringIO()
     try:
         with contextlib.redirect_stderr(report):
-            return tyro.cli(options, prog=f"warp-gi {command}", args=arguments, description=description, **settings)
+            given = tyro.cli(options, prog=f"warp-gi {command}", args=arguments, description=description, **settings)
+            return _at_home(given)
     except SystemExit as stop:
         if not stop.code:
             raise
         raise OptionError(_first_error(report.getvalue(), command)) from None
+
+
+def _check_empty(arguments: Sequence[str]) -> None:
+    """Raise OptionError for an argument that is empty, which would read as if it had been left out."""
+    for before, argument in zip(["", *arguments], arguments, strict=False):
+        flag_name, equals, value = argument.partition("=")
+        if not argument or (flag_name.startswith("--") and equals and not value):
+            place = f" after {before}" if not argument and before else f" of {flag_name}" if equals else ""
+            raise OptionError(
+                f"the argument{place} is empty (a variable that is not set?); give a value, or leave it out"
+            )
+
+
+def _at_home(options: Options) -> Options:
+    """Return options with the home of the user for ``~`` in paths; shells leave it where it is quoted or after =."""
+    for one in dataclasses.fields(options):  # type: ignore[arg-type]
+        value = getattr(options, one.name)
+        if isinstance(value, Path):
+            setattr(options, one.name, user_path(value))
+        elif isinstance(value, str) and value.startswith("~"):
+            setattr(options, one.name, str(user_path(value)))
+        elif isinstance(value, tuple) and any(isinstance(item, Path) for item in value):
+            setattr(options, one.name, tuple(user_path(item) for item in value))
+    return options
 
 
 def _first_error(report: str, command: str) -> str:

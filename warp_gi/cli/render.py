@@ -26,7 +26,7 @@ from warp_gi.cli.options import flag, parse_options, value_given
 from warp_gi.cli.pipelines import find_denoiser, pipeline_named, with_settings_shared
 from warp_gi.cli.report import Reporter, run_command
 from warp_gi.errors import OptionError
-from warp_gi.files import check_writable
+from warp_gi.files import check_target, check_writable, frame_path
 from warp_gi.frame import Frame
 from warp_gi.pipeline import DEFAULT, NORMAL, Pipeline
 from warp_gi.scene.baked import BakedScene
@@ -133,6 +133,8 @@ def run(options: Render, report: Reporter) -> None:
         raise OptionError("--reuse-pixel goes with --reuse-pictures; give that too")
     resolution = parse_resolution(options.resolution) if options.resolution else None
     frame_time = parse_seconds(options.frame_time) if options.frame_time else None
+    output = find_output(options)
+    check_targets(options)
     bakes = [load_bake(path) for path in options.bake]
     with report.phase("scene"):
         scene = BakedScene(load_bake(options.scene)) if options.scene.endswith(BAKE_SUFFIX) else find_scene(options)
@@ -147,7 +149,7 @@ def run(options: Render, report: Reporter) -> None:
     scheduler = FrameScheduler(source, camera, options.settings, options.device, options.seed, report.stage, bakes)
     if options.reuse_pictures is not None:
         check_pictures(scheduler, shots[-1].camera, options.reuse_pixel)
-    sequence = SequenceRun(scheduler, shots, find_output(options))
+    sequence = SequenceRun(scheduler, shots, output)
     with report.phase("bake"):
         sequence.bake()
     if frame_time is not None:
@@ -181,8 +183,11 @@ def describe(options: Render, scene: Scene | BakedScene, report: Reporter) -> No
     report.line(f"{scene.name}: a bake, without its scene")
     if options.environment:
         raise OptionError("--environment goes with a scene; a bake shows the sky that it was baked under")
-    if options.environment_turn or options.smooth is not None or options.scale != 1.0:
-        raise OptionError("--environment-turn, --smooth and --scale go with a scene; a bake shows what was baked")
+    of_file = options.smooth is not None or options.scale != 1.0 or options.up != "y" or options.recentre
+    if options.environment_turn or of_file:
+        raise OptionError(
+            "--environment-turn, --smooth, --scale, --up and --recentre go with a scene; a bake shows what was baked"
+        )
 
 
 def find_shots(options: Render, camera: Camera | CameraPath) -> list[Shot]:
@@ -192,6 +197,14 @@ def find_shots(options: Render, camera: Camera | CameraPath) -> list[Shot]:
     else:
         frames = list(range(camera.frame_count)) if isinstance(camera, CameraPath) else [0]
     return shots_of(camera, frames, options.output)
+
+
+def check_targets(options: Render) -> None:
+    """Raise before the scene is loaded, for frames that are none and for files that cannot be written."""
+    for index in parse_frames(options.frames) if options.frames else [0]:
+        path = frame_path(options.output, index)
+        if not options.resume or not path.is_file():  # a whole one is kept
+            check_target(path)
 
 
 def find_output(options: Render) -> Output:

@@ -62,6 +62,29 @@ def moved_keyframes(keyframes: Sequence[Keyframe], move: np.ndarray) -> list[Key
     return [replace(key, translation=tuple((np.array(key.translation) + move).tolist())) for key in keyframes]
 
 
+def turned_quaternion(rotation: np.ndarray, quaternion: ArrayLike) -> tuple[float, float, float, float]:
+    """Return the quaternion x, y, z, w of a rotation [3, 3] after that of another quaternion."""
+    x, y, z, w = np.asarray(quaternion, np.float64)
+    # of the largest of the four: 4 q q^T from the matrix (Shepperd 1978)
+    m = rotation
+    products = np.array(
+        [
+            [1 + m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[2, 1] - m[1, 2]],
+            [m[0, 1] + m[1, 0], 1 - m[0, 0] + m[1, 1] - m[2, 2], m[1, 2] + m[2, 1], m[0, 2] - m[2, 0]],
+            [m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1 - m[0, 0] - m[1, 1] + m[2, 2], m[1, 0] - m[0, 1]],
+            [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], 1 + m[0, 0] + m[1, 1] + m[2, 2]],
+        ]
+    )
+    largest = int(np.argmax(np.diag(products)))
+    a, b, c, d = products[largest] / np.linalg.norm(products[largest])
+    return (
+        float(d * x + a * w + b * z - c * y),
+        float(d * y - a * z + b * w + c * x),
+        float(d * z + a * y - b * x + c * w),
+        float(d * w - a * x - b * y - c * z),
+    )
+
+
 def set_keyframes(node: Node, keyframes: Sequence[Keyframe], offset: np.ndarray) -> None:
     """Give a node keyframes; of those of a root, which are in a file's coordinates, ``offset`` [3] is taken."""
     node.keyframes = moved_keyframes(keyframes, -offset) if node.parent is None else list(keyframes)

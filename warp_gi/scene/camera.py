@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_gi.errors import OptionError, SceneError, unknown_name
+from warp_gi.files import user_path
 from warp_gi.scene.pinhole import Camera
 
 if TYPE_CHECKING:
@@ -202,7 +203,7 @@ class CameraPath:
         """
         from warp_gi.scene.camera_files import read_camera_path
 
-        return read_camera_path(Path(path))
+        return read_camera_path(user_path(path))
 
     def save(self, path: str | Path) -> None:
         """Write the path as JSON, in the file's coordinates."""
@@ -223,7 +224,7 @@ class CameraPath:
                 del key["hfov"]
             keys.append(key)
         document = {"fps": self.fps, "resolution": list(self.resolution), "keyframes": keys}
-        Path(path).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        user_path(path).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
 def frame_time(camera: Camera | CameraPath, index: int) -> float:

@@ -6,10 +6,12 @@ import os
 import struct
 import warnings
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
-from warp_gi.errors import OptionError, SceneError, one_line
+from warp_gi.errors import OptionError, SceneError, one_line, unknown_name
+from warp_gi.files import user_path
 from warp_gi.scene.environment import Sky
 from warp_gi.scene.files.images import missing_file
 from warp_gi.scene.files.parts import SceneParts
@@ -20,6 +22,12 @@ from warp_gi.scene.scene import Scene
 
 EXTENSIONS = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
 
+UPRIGHT = {
+    "x": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
+    "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+}
+"""Rotation that makes an axis of a file y."""
 LARGEST_STEP = 0.001
 """Distance in metres between neighbouring float32 coordinates from which a scene is recentred."""
 DAMAGE = (ArithmeticError, AttributeError, EOFError, LookupError, NameError, OSError, TypeError, ValueError)
@@ -32,6 +40,7 @@ def load_scene(
     smooth: float | None = None,
     scale: float = 1.0,
     recentre: bool | None = None,
+    up: Literal["x", "y", "z"] = "y",
 ) -> Scene:
     """Load a scene from a GLB, glTF, OBJ (with MTL), PLY, STL or OFF file.
 
@@ -45,10 +54,14 @@ def load_scene(
             ``Scene.offset`` is what was taken: nodes, bounds and the buffer "position" are without it. Cameras, and
             keyframes for ``Scene.animate``, are still given in the file's coordinates. None does so, with a warning,
             where float32 has steps of more than a millimetre.
+        up: Axis of the file that points up, and becomes y. Where it is z, as in surveys and CAD, (x, y, z) of the file
+            is (x, z, -y) of the scene. All else, cameras too, is then given in the turned coordinates.
 
     Raises SceneError if the file or anything it names is missing, damaged or unusable: one line.
     """
-    path = Path(path)
+    if not str(path):
+        raise SceneError("the name of the scene file is empty; give a GLB, glTF, OBJ or PLY file")
+    path = user_path(path)
     suffix = path.suffix.lower()
     if not path.is_file():
         raise missing_file(path, "scene file")
@@ -58,6 +71,8 @@ def load_scene(
         raise OptionError(f"smooth must be an angle from 0 to 180 degrees, got {smooth}")
     if not (np.isfinite(scale) and scale > 0.0):
         raise OptionError(f"scale must be a finite number above 0, got {scale}")
+    if up not in UPRIGHT:
+        raise unknown_name("axis that points up", up, UPRIGHT)
     try:
         parts = _read(path, suffix)
     except SceneError:
@@ -73,6 +88,8 @@ def load_scene(
         parts = parts.smoothed(smooth)
     if scale != 1.0:
         parts = parts.scaled(scale)
+    if up != "y":
+        parts = parts.turned(np.array(UPRIGHT[up], np.float64))
     if not any(len(mesh.indices) for node in parts.nodes for mesh in node.meshes):
         raise SceneError(f"{str(path)!r} holds no triangles; export it with faces")
     scene = Scene(parts.nodes, parts.lights, environment, parts.cameras, path.stem, parts.camera_nodes)

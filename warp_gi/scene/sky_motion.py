@@ -79,9 +79,8 @@ class SkySequence:
     def __post_init__(self) -> None:
         _check_fps("a sequence of skies", self.fps)
         pattern, layer = split_layer(self.pattern)
-        if layer:
-            object.__setattr__(self, "pattern", pattern)
-            object.__setattr__(self, "layer", layer)
+        object.__setattr__(self, "pattern", pattern)
+        object.__setattr__(self, "layer", layer or self.layer)
         if "#" not in Path(self.pattern).name:
             raise SceneError(f"{self.pattern}: put #### where the number of the frame is, as in sky.####.exr")
         if not frames_there(self.pattern):

@@ -18,7 +18,7 @@ from typing import Protocol
 import numpy as np
 
 from warp_gi.errors import OptionError, SceneError
-from warp_gi.files import frame_path, replacing
+from warp_gi.files import frame_path, replacing, user_path
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.pinhole import offset_text
 from warp_gi.sequence.exr import Attribute, plain, read_exr, stored_values, write_exr
@@ -210,7 +210,7 @@ def write_preview(frame: HasBuffers, path: str | Path, exposure: float = 0.0) ->
 
 def read_frame(path: str | Path) -> FrameFile:
     """Read a frame's buffers and metadata back; raises SceneError when the file is missing or not whole."""
-    buffers, attributes, formats = read_exr(path)
+    buffers, attributes, formats = read_exr(user_path(path))
     numbers = {name: value for name, value in attributes.items() if not isinstance(value, np.ndarray)}
     metadata = {k[len(PREFIX) :]: v for k, v in numbers.items() if k.startswith(PREFIX) and not k.startswith(TIMES)}
     timings = {k[len(TIMES) :]: float(v) for k, v in numbers.items() if k.startswith(TIMES)}

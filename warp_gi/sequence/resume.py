@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Literal
 
 from warp_gi.baking import load_bake
 from warp_gi.errors import BakeError, OptionError, unknown_name
-from warp_gi.files import check_writable, frame_path, remove_stale_parts
+from warp_gi.files import check_target, check_writable, frame_path, remove_stale_parts, user_path
 from warp_gi.scene.camera import Camera, CameraPath, frame_time
 from warp_gi.sequence.exr import Attribute
 from warp_gi.sequence.frames import (
@@ -59,7 +59,7 @@ class Output:
     """Exposure of PNG files in stops."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "pattern", Path(self.pattern))
+        object.__setattr__(self, "pattern", user_path(self.pattern))
         if self.pattern.suffix.lower() not in (".exr", ".png"):
             raise OptionError(f"cannot write {self.pattern.name}: frames are .exr or .png files")
         if self.precision not in PRECISIONS:
@@ -232,6 +232,8 @@ class SequenceRun:
         if plan.todo:
             check_writable(self.output.pattern.parent)
             remove_stale_parts(self.output.state_path)
+        for shot in plan.todo:
+            check_target(shot.path)
         if plan.done:
             _LOG.info("%d of %d frames are there already", len(plan.done), len(plan.shots))
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from warp_gi.scene.animation import moved_keyframes, world_matrices
+from warp_gi.scene.animation import moved_keyframes, turned_quaternion, world_matrices
 from warp_gi.scene.model import Mesh, Node, PunctualLight
 from warp_gi.scene.normals import smooth_mesh
 from warp_gi.scene.pinhole import Camera
@@ -110,6 +111,41 @@ class SceneParts:
             {name: scaled_camera(camera) for name, camera in self.cameras.items()},
             self.camera_nodes,
             scale * self.offset,
+        )
+
+    def turned(self, rotation: np.ndarray) -> SceneParts:
+        """Return the parts turned about the origin by a rotation [3, 3]."""
+        turn = np.eye(4)
+        turn[:3, :3] = rotation
+
+        def turned_vector(vector: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
+            x, y, z = (rotation @ np.array(vector)).tolist()
+            return x, y, z
+
+        def turned_node(node: Node) -> Node:
+            if node.parent is not None:
+                return node
+            keys = [
+                replace(k, translation=turned_vector(k.translation), rotation=turned_quaternion(rotation, k.rotation))
+                for k in node.keyframes or ()
+            ]
+            return replace(node, parent_from_node=turn @ node.parent_from_node, keyframes=keys or None)
+
+        def turned_light(light: PunctualLight) -> PunctualLight:
+            if light.node is not None:
+                return light
+            return replace(light, position=turned_vector(light.position), direction=turned_vector(light.direction))
+
+        def turned_camera(camera: Camera) -> Camera:
+            matrix = turn @ camera.world_from_camera
+            return replace(camera, world_from_camera=matrix, offset=turned_vector(camera.offset))
+
+        return SceneParts(
+            [turned_node(node) for node in self.nodes],
+            [turned_light(light) for light in self.lights],
+            {name: turned_camera(camera) for name, camera in self.cameras.items()},
+            self.camera_nodes,
+            rotation @ self.offset,
         )
 
     def smoothed(self, angle: float) -> SceneParts:

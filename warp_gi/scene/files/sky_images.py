@@ -17,6 +17,7 @@ import numpy as np
 
 from warp_gi.color import RGB_FROM_XYZ, decode_srgb, rgb_from_primaries
 from warp_gi.errors import SceneError, one_line
+from warp_gi.files import user_path
 
 LARGEST_HEIGHT = 4096  # texel coordinates must be exact in float32 with bits left to interpolate
 BEAUTY = ("beauty", "combined", "rgba", "rgb", "default")
@@ -57,9 +58,10 @@ class RadianceHeader:
 
 def split_layer(text: str | Path) -> tuple[Path, str]:
     """Return the file and the layer of "FILE:layer"; the layer of a mere file is "". A name with a colon may be one."""
-    match = re.fullmatch(r"(.+\.\w+):([^/\\]+)", str(text))
-    if not match or Path(text).is_file():
-        return Path(text), ""
+    path = user_path(text)
+    match = re.fullmatch(r"(.+\.\w+):([^/\\]+)", str(path))
+    if not match or path.is_file():
+        return path, ""
     return Path(match[1]), match[2]
 
 
