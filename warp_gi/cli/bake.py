@@ -28,6 +28,7 @@ from warp_gi.errors import OptionError
 from warp_gi.files import check_target, check_writable, remove_stale_parts
 from warp_gi.rendering import bake
 from warp_gi.scene.camera import Camera, CameraPath
+from warp_gi.scene.files.sky_images import split_layer
 from warp_gi.scene.scene import Scene
 from warp_gi.stateful import Stateful
 from warp_gi.techniques.bake_tool import BakeTool, ExportRequest, ExportSettings
@@ -223,7 +224,8 @@ def run(options: BakeOptions, report: Reporter) -> None:
 
 def check_files(options: BakeOptions, files: Sequence[Path]) -> None:
     """Raise OptionError for files to write that are read, OSError for those that cannot be written."""
-    read = {name: Path(name) for name in (options.scene, options.environment, options.camera) if Path(name).is_file()}
+    given = {name: split_layer(name)[0] for name in (options.scene, options.environment, options.camera)}
+    read = {name: path for name, path in given.items() if path.is_file()}
     for file in files:
         check_target(file)
         for name, path in read.items():

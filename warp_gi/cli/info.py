@@ -49,7 +49,14 @@ def main(arguments: Sequence[str]) -> int:
     if scene.cameras:
         rows = []
         for name, camera in scene.cameras.items():
-            rows.append((name, _numbers(camera.position), _numbers(-camera.world_from_camera[:3, 2]), camera.hfov))
+            rows.append(
+                (
+                    name,
+                    _numbers(camera.position + camera.offset),
+                    _numbers(-camera.world_from_camera[:3, 2]),
+                    camera.hfov,
+                )
+            )
         print_table("cameras", ("name", "position [m]", "direction", "hfov [deg]"), rows)
     return 0
 
