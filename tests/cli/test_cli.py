@@ -335,7 +335,7 @@ def test_a_folder_in_the_way_is_named(capfd, tmp_path):
     (tmp_path / "a.exr").mkdir()
     small = ["--resolution", "4x4", "--spp", "1", "--frames", "0", "--quiet"]
     assert cli.main(["render", "cornell_box", *small, "-o", str(tmp_path / "a.exr")]) == 2
-    assert f"{tmp_path / 'a.exr'}: Is a directory" in capfd.readouterr().err
+    assert f"{tmp_path / 'a.exr'}: is a folder; name a file in it" in capfd.readouterr().err
 
 
 def test_traceback_on_demand(monkeypatch):
