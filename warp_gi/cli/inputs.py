@@ -180,7 +180,7 @@ def _find_camera(options: SceneOptions, scene: Scene | BakedScene, report: Repor
     if options.hfov is not None:
         if isinstance(camera, CameraPath):
             raise OptionError("--hfov goes with a still camera; a camera path has its own field of view")
-        camera = replace(camera, hfov=options.hfov, keeps_vfov=False)
+        camera = replace(camera, hfov=options.hfov, keeps_vertical=False)
     return camera
 
 

@@ -44,7 +44,7 @@ class CameraKey:
     """By how much the middle of the picture is right of the view axis, in widths, and above it, in heights."""
     pixel_aspect: float = 1.0
     """Width of a pixel by its height."""
-    keeps_vfov: bool = False
+    keeps_vertical: bool = False
     """Whether the vertical field of view, and not the horizontal one, stays at another resolution."""
 
 
@@ -107,12 +107,12 @@ class CameraPath:
         return replace(self, keys=tuple(keys), offset=_three(offset))
 
     def at_resolution(self, width: int, height: int) -> CameraPath:
-        """Return the same path with another resolution; fields of view stay as ``CameraKey.keeps_vfov`` says."""
+        """Return the same path with another resolution; fields of view stay as ``CameraKey.keeps_vertical`` says."""
         wider = (width / height) / (self.resolution[0] / self.resolution[1])
 
         def fitted(key: CameraKey) -> CameraKey:
             half = math.tan(math.radians(key.hfov) / 2) * wider
-            return replace(key, hfov=2 * math.degrees(math.atan(half))) if key.keeps_vfov else key
+            return replace(key, hfov=2 * math.degrees(math.atan(half))) if key.keeps_vertical else key
 
         return replace(self, keys=tuple(fitted(key) for key in self.keys), resolution=(width, height))
 
@@ -133,7 +133,7 @@ class CameraPath:
         for camera, time in zip(cameras, times, strict=True):
             matrix = camera.relative_to(offset).world_from_camera
             target = matrix[:3, 3] - matrix[:3, 2]
-            lens = camera.hfov, camera.lens_shift, camera.pixel_aspect, camera.keeps_vfov
+            lens = camera.hfov, camera.lens_shift, camera.pixel_aspect, camera.keeps_vertical
             keys.append(CameraKey(time, _three(matrix[:3, 3]), _three(target), _three(matrix[:3, 1]), *lens))
         return cls(tuple(keys), fps, cameras[0].resolution if cameras else (960, 540), offset=offset)
 
@@ -218,7 +218,7 @@ class CameraPath:
             }
             if k.lens_shift != (0.0, 0.0) or k.pixel_aspect != 1.0:
                 key |= {"lens_shift": list(k.lens_shift), "pixel_aspect": k.pixel_aspect}
-            if k.keeps_vfov:
+            if k.keeps_vertical:
                 lens = Camera(np.eye(4), k.hfov, self.resolution, pixel_aspect=k.pixel_aspect)
                 key["vfov"] = lens.vfov
                 del key["hfov"]

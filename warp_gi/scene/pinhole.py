@@ -42,7 +42,7 @@ class Camera:
     """By how much the middle of the picture is right of the view axis, in widths, and above it, in heights."""
     pixel_aspect: float = 1.0
     """Width of a pixel by its height: the focal length in pixels downwards by that across."""
-    keeps_vfov: bool = False
+    keeps_vertical: bool = False
     """Whether the vertical field of view, and not the horizontal one, stays at another resolution."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Point in metres of a file's coordinates that ``world_from_camera`` counts from: that of a recentred scene."""
@@ -152,12 +152,13 @@ class Camera:
             raise OptionError(f"camera {self.name!r}: vfov must be between 0 and 180 degrees, got {vfov}")
         width, height = self.resolution
         half = math.tan(math.radians(vfov) / 2) * self.pixel_aspect * width / height
-        return replace(self, hfov=2 * math.degrees(math.atan(half)), keeps_vfov=True)
+        return replace(self, hfov=2 * math.degrees(math.atan(half)), keeps_vertical=True)
 
     def at_resolution(self, width: int, height: int) -> Camera:
-        """Return the same camera with another resolution; the field of view stays across, or down (``keeps_vfov``)."""
+        """Return the same camera with another resolution; see ``keeps_vertical`` for another shape."""
         camera = replace(self, resolution=(width, height))
-        return camera.with_vfov(self.vfov) if self.keeps_vfov else camera
+        is_alike = width * self.resolution[1] == height * self.resolution[0]
+        return camera if is_alike or not self.keeps_vertical else camera.with_vfov(self.vfov)
 
     @property
     def vfov(self) -> float:
