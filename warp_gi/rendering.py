@@ -121,6 +121,7 @@ def plan_sequence(
     *,
     output: str | Path,
     precision: Literal["half", "float"] = "half",
+    frame_time: float | None = None,
 ) -> Plan:
     """Return what ``render`` with these arguments and ``resume=True`` would render, and why; nothing is written.
 
@@ -133,7 +134,12 @@ def plan_sequence(
     scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, progress, bakes)
     files = Output(Path(output), precision)
     shots = shots_of(camera, wanted, files.pattern)
-    return SequenceRun(scheduler, shots, files).plan() if shots else Plan((), ())
+    if not shots:
+        return Plan((), ())
+    run = SequenceRun(scheduler, shots, files)
+    if frame_time is not None:
+        take_time(run, frame_time, resume=True)
+    return run.plan()
 
 
 def bake(
