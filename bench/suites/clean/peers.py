@@ -1,0 +1,5 @@
+"""stub"""
+
+
+def peer_rows(quick, device):
+    return []
