@@ -81,10 +81,7 @@ class SequenceCase:
         path = PLACES[self.place].path()
         if self.move is not None:
             begin = path.keys[0]
-            eye, target = (
-                tuple(float(a + b) for a, b in zip(point, self.move, strict=True))
-                for point in (begin.eye, begin.target)
-            )
+            eye, target = (_sum(point, self.move) for point in (begin.eye, begin.target))
             end = replace(begin, time=self.judged.last / path.fps, eye=eye, target=target)
             path = replace(path, keys=(begin, end))
         return path.at_resolution(*self.size)
@@ -94,6 +91,10 @@ class SequenceCase:
         judged = Judged(0, min(last - 1, Judged().middle), last)
         small = replace(self, size=size, judged=judged, reference_spp=reference_spp)
         return replace(small, most_flip=None, most_seconds=None, within=1.0)
+
+
+def _sum(one: Point, other: Point) -> Point:
+    return one[0] + other[0], one[1] + other[1], one[2] + other[2]
 
 
 def sunny_sponza() -> gi.Scene:
@@ -111,9 +112,7 @@ BUILT_IN = (
     SequenceCase("cornell_box", within=0.02),
 )
 FROM_FILES = (
-    SequenceCase(
-        "living_room", move=(0.45, 0.1, -0.45), size=LARGE, most_flip=0.06, within=0.02, most_seconds=0.45
-    ),
+    SequenceCase("living_room", move=(0.45, 0.1, -0.45), size=LARGE, most_flip=0.06, within=0.02, most_seconds=0.45),
     SequenceCase("modern_hall", move=(-0.6, 0.0, -0.35), most_flip=0.07, within=0.02),
     SequenceCase("sponza_courtyard", move=(2.0, 0.0, 0.0)),
     SequenceCase("sponza", "Sponza, sun", (2.0, 0.0, 0.0), sunny_sponza),

@@ -4,9 +4,19 @@ from warp_gi.bench.harness.columns import COUNT, ERROR, MEMORY, RATIO, TIME, col
 
 COLUMNS = columns(
     "clean",
-    keys("case", "pixels", "renderer", "spp", "frame", "frames later", "state"),
+    keys("case", "pixels", "contender", "renderer", "family", "spp", "frame", "frames later", "state"),
     notes("most FLIP", "most s a frame", "most flicker", "most alike", "least mean", "most mean", "most left"),
-    notes("most of flicker", "most of FLIP", "least faster", "most s", "most first s", "reference", "reached", "version"),
+    notes(
+        "most of flicker",
+        "most of FLIP",
+        "least faster",
+        "least FLIP",
+        "most s",
+        "most first s",
+        "reference",
+        "reached",
+        "version",
+    ),
     # the middle frame against the reference, and others
     measured(ERROR, "", "lower", "FLIP", "FLIP first", "FLIP last", "relMSE"),
     measured(ERROR, "times", None, "mean", "mean first", "mean last", "mean of all"),
@@ -20,7 +30,8 @@ COLUMNS = columns(
     measured(COUNT, "frames", None, "frames"),
     # beside others
     measured(ERROR, "times", "lower", "flicker / OIDN", "FLIP / OIDN"),
-    measured(RATIO, "times", "higher", "times less, cpu", "faster"),
+    measured(RATIO, "times", "higher", "times less, cpu", "time / clean"),
+    measured(ERROR, "times", "higher", "FLIP / clean"),
     # references
     measured(COUNT, "samples", None, "reference spp"),
     measured(ERROR, "", None, "FLIP of its halves", "FLIP of cleaned halves", "flicker of the reference"),

@@ -100,7 +100,7 @@ def _rough(values: np.ndarray) -> np.ndarray:
 
 
 def _likeness(one: np.ndarray, other: np.ndarray, wall: np.ndarray, step: int) -> float:
-    """Return the mean product of ``one`` and of ``other`` so many pixels to the right and below, where both are wall."""
+    """Return the mean product of ``one`` with ``other`` so many pixels to the right and below, both on walls."""
     total, count = 0.0, 0
     for axis in (0, 1):
         size = one.shape[axis] - step

@@ -24,7 +24,6 @@ from warp_gi.bench.harness.measure import Row
 from warp_gi.bench.suites.clean import measures
 from warp_gi.errors import OptionError
 from warp_gi.files import replacing
-from warp_gi.scene.camera import frame_time
 
 FORMAT = "warp_gi reference 1"
 """Changes with what the files hold, and with what the path tracer's pictures converge to."""
@@ -33,7 +32,6 @@ GUIDE_SPP = 16
 """Samples a pixel of the guides by which references are cleaned."""
 TOO_NOISY = 0.05
 """FLIP between a reference's halves above which pictures are compared with a cleaned one."""
-NO_LIGHT = {"environment": None, "emitters": None, "indirect": None}
 PLAIN, CLEANED = "plain", "cleaned by OIDN"
 Halves = tuple[np.ndarray, np.ndarray]
 
@@ -55,7 +53,7 @@ class Truth:
     noise: float
     """FLIP between the halves."""
     cleaned: Halves | None
-    """The halves, each cleaned by Open Image Denoise; None where that is not installed or not needed."""
+    """The halves, each cleaned by Open Image Denoise; None where that is not installed."""
 
     @cached_property
     def mean(self) -> float:
@@ -71,7 +69,12 @@ class Truth:
     @cached_property
     def shown(self) -> np.ndarray:
         """The picture that FLIP is against, and that relative errors are over."""
-        return np.mean(self.halves if self.cleaned is None else self.cleaned, axis=0)
+        return np.mean(self.cleaned if self.is_cleaned and self.cleaned else self.halves, axis=0)
+
+    @property
+    def is_cleaned(self) -> bool:
+        """Whether pictures are compared with the cleaned reference: the halves differ much, and it can be cleaned."""
+        return self.cleaned is not None and self.noise > TOO_NOISY
 
     def quality(self, picture: np.ndarray) -> Row:
         """Return FLIP, relMSE and the mean over the reference's."""
@@ -83,7 +86,7 @@ class Truth:
 
     def row(self) -> Row:
         """Return what the reference is worth: FLIP between its halves, and between the cleaned ones."""
-        row: Row = {"reference": PLAIN if self.cleaned is None else CLEANED, "mean error": self.mean_error}
+        row: Row = {"reference": CLEANED if self.is_cleaned else PLAIN, "mean error": self.mean_error}
         row["FLIP of its halves"] = self.noise
         row["FLIP of cleaned halves"] = "" if self.cleaned is None else metrics.flip(*self.cleaned)
         return row
@@ -99,8 +102,7 @@ def truth(
     moment = frame if moment is None else moment
     scene, camera = still(build(), moment / path.fps), path.camera(frame)
     halves = kept(scene, camera, moment, spp, device)
-    noise = metrics.flip(*halves)
-    return Truth(halves, noise, cleaned(scene, camera, moment, halves, device) if noise > TOO_NOISY else None)
+    return Truth(halves, metrics.flip(*halves), cleaned(scene, camera, moment, halves, device))
 
 
 def still(scene: gi.Scene, time: float) -> gi.Scene:
@@ -137,18 +139,43 @@ def key(scene: gi.Scene, camera: gi.Camera, moment: int, spp: int) -> str:
 
 
 def cleaned(scene: gi.Scene, camera: gi.Camera, moment: int, halves: Halves, device: str) -> Halves | None:
-    """Return both halves cleaned by Open Image Denoise at its best quality; None where it is not installed."""
+    """Return both halves cleaned; None where Open Image Denoise is not installed."""
+    clean = cleaner(scene, camera, moment, device)
+    return None if clean is None else (clean(halves[0]), clean(halves[1]))
+
+
+def cleaner(scene: gi.Scene, camera: gi.Camera, moment: int, device: str) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Return Open Image Denoise at its best quality, with guides of this frame; None where it is not installed.
+
+    It gets light without emission, as with bright lamps in it light would be lost. Pixels of lamps stay as they are.
+    """
     try:
         library = gi.Oidn().start(scene, device)
     except OptionError:
         return None
-    pipeline = gi.Pipeline(**NO_LIGHT, spp=GUIDE_SPP, camera_samples=GUIDE_SPP)
+    pipeline = _no_light(GUIDE_SPP)
     guides = gi.FrameScheduler(scene, camera, pipeline, device, SEED).frame(moment, moment)
     albedo, normal = np.clip(guides.numpy("albedo"), 0.0, 1.0), guides.numpy("normal")
-    one, other = (
-        np.asarray(library.denoise(half, albedo, normal, hdr=True, quality="high"), np.float32) for half in halves
-    )
-    return one, other
+    emission = guides.numpy("emission").copy()
+    lamps = grown(emission.max(-1) > 0)[..., None]
+
+    def clean(picture: np.ndarray) -> np.ndarray:
+        light = library.denoise(np.maximum(picture - emission, 0.0), albedo, normal, hdr=True, quality="high")
+        return np.asarray(np.where(lamps, picture, light + emission), np.float32)
+
+    return clean
+
+
+def _no_light(spp: int) -> gi.Pipeline:
+    """Return a pipeline whose frames have guides and emission alone."""
+    return gi.Pipeline(environment=None, emitters=None, indirect=None, spp=spp, camera_samples=spp)
+
+
+def grown(pixels: np.ndarray) -> np.ndarray:
+    """Return which pixels [height, width] are chosen, or have one of the eight around them that is."""
+    padded = np.pad(pixels, 1)
+    height, width = pixels.shape
+    return np.any([padded[y : y + height, x : x + width] for y in range(3) for x in range(3)], axis=0)
 
 
 @dataclass(frozen=True)
@@ -161,7 +188,6 @@ class Guides:
     @classmethod
     def of(cls, scene: gi.Scene, path: gi.CameraPath, frame: int, device: str) -> Guides:
         """Return those of a frame."""
-        pipeline = gi.Pipeline(**NO_LIGHT, spp=1, camera_samples=1)
-        found = gi.FrameScheduler(scene, path, pipeline, device).frame(frame)
+        found = gi.FrameScheduler(scene, path, _no_light(1), device).frame(frame)
         surfaces = (found.numpy(name) for name in ("object_id", "normal", "albedo"))
         return cls(found.numpy("motion"), measures.walls(*surfaces))

@@ -94,7 +94,7 @@ def shots_row(case: SequenceCase, shots: Shots, truths: Truths, guides: Guides, 
     judged, pictures = case.judged, shots.pictures
     pixels = float(np.prod(case.size))
     row: Row = {"table": SEQUENCES, "case": case.name, "pixels": "x".join(map(str, case.size))}
-    row |= {"renderer": shots.renderer, "spp": shots.spp}
+    row |= shots.row
     middle = truths[judged.middle]
     row |= middle.quality(pictures[judged.middle])
     for name, frame in (("first", judged.first), ("last", judged.last)):
