@@ -5,7 +5,7 @@ from warp_gi.bench.harness.columns import COUNT, ERROR, MEMORY, RATIO, TIME, col
 COLUMNS = columns(
     "clean",
     keys("case", "pixels", "contender", "renderer", "family", "spp", "frame", "frames later", "state"),
-    notes("most FLIP", "most s a frame", "most flicker", "most alike", "least mean", "most mean", "most left"),
+    notes("most FLIP", "most s a frame", "most pattern", "least mean", "most mean", "most left"),
     notes(
         "most of flicker",
         "most of FLIP",
@@ -21,8 +21,8 @@ COLUMNS = columns(
     measured(ERROR, "", "lower", "FLIP", "FLIP first", "FLIP last", "relMSE"),
     measured(ERROR, "times", None, "mean", "mean first", "mean last", "mean of all"),
     measured(ERROR, "share of the light", "lower", "flicker", "fine error"),
-    measured(ERROR, "", None, "alike at 1"),
-    measured(ERROR, "", "lower", "alike at 2"),
+    measured(ERROR, "", None, "alike at 1", "alike at 2"),
+    measured(ERROR, "", "lower", "pattern"),
     measured(ERROR, "share", "lower", "old light left"),
     # time and memory
     measured(TIME, "us", "lower", "us a pixel"),

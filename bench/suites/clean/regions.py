@@ -82,9 +82,11 @@ _CLEAN = Region(
     (
         Text(
             "Frame 23 of 48. FLIP is against a reference whose own halves differ as told; where these differ by more "
-            "than 0.05 it is cleaned by OIDN, as are the halves of the next column. The mean is of all 48 frames over "
-            'that of paths, and of the first frame over the reference. "Blended" is `denoise.blend` 0.25.',
-            {},
+            "than 0.05 it is cleaned by OIDN, as are the halves of the next column. The mean is of all 48 frames, and "
+            'of the first. "Blended" is `denoise.blend` 0.25. How much more alike errors on flat walls are two pixels '
+            "apart than one, which is 1 for a grid, 0 for noise and below it for what is smooth: {pattern}.",
+            {"pattern": Figure("pattern", {"renderer": CLEAN}, at_most="most pattern")},
+            SEQUENCES,
         ),
         _ERRORS,
         Text(

@@ -16,8 +16,8 @@ from warp_gi.bench.suites.clean.references import Guides, Truth, truth
 
 SEQUENCES, BESIDE, REFERENCE = "sequences", "clean beside path, OIDN", "references"
 QUICK_SIZE, QUICK_LAST, QUICK_SPP = (64, 36), 4, 64
-MOST_ALIKE = 0.3
-"""Largest likeness of errors two pixels apart: more is a pattern."""
+MOST_PATTERN = 0.3
+"""Largest "pattern": how much more alike errors are two pixels apart than one. Smooth errors have none."""
 MOST_FLICKER = 0.25
 """Largest flicker over that of paths with one sample and OIDN."""
 TIMES = 10.0
@@ -26,7 +26,7 @@ MOST_SHOWN = 16
 """Most samples a pixel of pictures in a report."""
 SAMPLES, QUICK_SAMPLES = (1, 4, 16, 64), (1, 4)
 ONLY_CLEAN = ("fill s", "fill cpu s", "compile s", "peak GB")
-LIMITS = ("most FLIP", "most alike", "most s a frame", "least mean", "most mean")
+LIMITS = ("most FLIP", "most pattern", "most s a frame", "least mean", "most mean")
 Truths = Mapping[int, Truth]
 
 
@@ -75,8 +75,7 @@ def case_rows(case: SequenceCase, device: str, gallery: Gallery, samples: Sequen
     ours[0].step(scene, path, case.judged.first, case.judged.all, device)
     peak = memory.bytes  # before any other contender has anything in memory
     shots = take_turns([*ours, *others], scene, path, case.judged.all, device)
-    means = next(one.means for one in shots if one.renderer == PATH and one.spp == 1)
-    found = {(one.renderer, one.spp): shots_row(case, one, truths, guides, means) for one in shots}
+    found = {(one.renderer, one.spp): shots_row(case, one, truths, guides) for one in shots}
     for one in ours:
         found[one.name, one.pipeline.spp] |= one.row
     found[CLEAN, ours[0].pipeline.spp] |= {"peak GB": peak / 1e9} | wanted(case)
@@ -89,7 +88,7 @@ def case_rows(case: SequenceCase, device: str, gallery: Gallery, samples: Sequen
     return [*found.values(), *beside_rows(case, found), *reference_rows(case, truths, guides)]
 
 
-def shots_row(case: SequenceCase, shots: Shots, truths: Truths, guides: Guides, means: Mapping[int, float]) -> Row:
+def shots_row(case: SequenceCase, shots: Shots, truths: Truths, guides: Guides) -> Row:
     """Return the row of one renderer: errors of the middle frame, of the first and last, flicker, pattern, seconds."""
     judged, pictures = case.judged, shots.pictures
     pixels = float(np.prod(case.size))
@@ -100,8 +99,8 @@ def shots_row(case: SequenceCase, shots: Shots, truths: Truths, guides: Guides, 
     for name, frame in (("first", judged.first), ("last", judged.last)):
         there = truths[frame].quality(pictures[frame]) if frame in pictures else {}
         row |= {f"FLIP {name}": there.get("FLIP", ""), f"mean {name}": there.get("mean", "")}
-    whole = all(frame in shots.means for frame in means) and means
-    row["mean of all"] = sum(shots.means[k] for k in means) / sum(means.values()) if whole else ""
+    whole = len(shots.means) == judged.count
+    row["mean of all"] = sum(shots.means.values()) / sum(means_between(truths, judged.count)) if whole else ""
     row |= steadiness(pictures[judged.middle], pictures[judged.before], middle, guides)
     later = [frame for frame in shots.times if frame not in (judged.first, min(shots.times))] or list(shots.times)
     wall, cpu = (np.array([shots.times[frame][kind] for frame in later]) for kind in (0, 1))
@@ -110,19 +109,24 @@ def shots_row(case: SequenceCase, shots: Shots, truths: Truths, guides: Guides, 
     return row | dict.fromkeys((*ONLY_CLEAN, *LIMITS), "")
 
 
+def means_between(truths: Truths, count: int) -> np.ndarray:
+    """Return the means of all frames, by a parabola through those of the references."""
+    frames, means = np.array([[frame, truth.mean] for frame, truth in truths.items()]).T
+    return np.asarray(np.polyval(np.polyfit(frames, means, 2), np.arange(count)))
+
+
 def steadiness(picture: np.ndarray, before: np.ndarray, middle: Truth, guides: Guides) -> Row:
     """Return flicker, and likeness and size of fine errors on flat walls."""
     found = measures.pattern(picture, middle.halves, guides.wall)
     names = ("alike at 1", "alike at 2", "fine error")
-    return {
-        "flicker": measures.flicker(picture, before, guides.motion, middle.shown),
-        **dict(zip(names, found or ("",) * 3, strict=True)),
-    }
+    row: Row = {"flicker": measures.flicker(picture, before, guides.motion, middle.shown)}
+    row |= dict(zip(names, found or ("",) * 3, strict=True))
+    return row | {"pattern": found[1] - max(found[0], 0.0) if found else ""}
 
 
 def wanted(case: SequenceCase) -> Row:
     """Return what is wanted of the preset ``clean``."""
-    row: Row = {"most FLIP": "" if case.most_flip is None else case.most_flip, "most alike": MOST_ALIKE}
+    row: Row = {"most FLIP": "" if case.most_flip is None else case.most_flip, "most pattern": MOST_PATTERN}
     row |= {"most s a frame": "" if case.most_seconds is None else case.most_seconds}
     return row | {"least mean": 1 - case.within, "most mean": 1 + case.within}
 
