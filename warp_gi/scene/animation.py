@@ -26,18 +26,22 @@ def pose_matrix(translation: ArrayLike, rotation: ArrayLike, scale: ArrayLike) -
     return matrix
 
 
-def slerp(start: ArrayLike, end: ArrayLike, weight: float) -> np.ndarray:
-    """Return the unit quaternion (x, y, z, w) ``weight`` of the shorter way from ``start`` to ``end``."""
-    a, b = (np.asarray(one, np.float64) / np.linalg.norm(np.asarray(one)) for one in (start, end))
-    cosine = float(a @ b)
-    if cosine < 0.0:
-        b, cosine = -b, -cosine
-    if cosine > 1.0 - 1e-9:
-        blend = a + weight * (b - a)
-    else:
-        angle = np.arccos(cosine)
-        blend = np.sin((1.0 - weight) * angle) * a + np.sin(weight * angle) * b
-    return blend / np.linalg.norm(blend)
+def slerp(start: ArrayLike, end: ArrayLike, weight: float | np.ndarray) -> np.ndarray:
+    """Return the unit quaternions (x, y, z, w) ``weight`` of the shorter way from ``start`` to ``end``, [..., 4].
+
+    ``weight`` is a number or [..., 1].
+    """
+    a, b = (np.asarray(one, np.float64) for one in (start, end))
+    a, b = (one / np.linalg.norm(one, axis=-1, keepdims=True) for one in (a, b))
+    cosine = np.sum(a * b, axis=-1, keepdims=True)
+    b, cosine = np.where(cosine < 0.0, -b, b), np.abs(cosine)
+    angle = np.arccos(np.minimum(cosine, 1.0))
+    near = cosine > 1.0 - 1e-9
+    sine = np.where(near, 1.0, np.sin(angle))
+    rest = np.where(near, 1.0 - weight, np.sin((1.0 - weight) * angle) / sine)
+    part = np.where(near, weight, np.sin(weight * angle) / sine)
+    blend = rest * a + part * b
+    return blend / np.linalg.norm(blend, axis=-1, keepdims=True)
 
 
 def keyframe_matrix(keyframes: Sequence[Keyframe], time: float) -> np.ndarray:

@@ -34,6 +34,7 @@ def load_scene(
             edges that bend more than this; None leaves them flat, as glTF asks.
         scale: Metres in one unit of the file. Radiance and intensities are left as they are.
 
+    Gives an UnsupportedWarning for each feature that the file uses and this library does not read in full.
     Raises SceneError if the file or anything it names is missing, damaged or unusable: one line.
     """
     path = Path(path)
@@ -56,6 +57,7 @@ def load_scene(
         raise SceneError(
             f"{str(path)!r} cannot be read as {kind} ({type(error).__name__}: {reason}); export or copy it again"
         ) from error
+    parts.findings.warn(path, stacklevel=2)
     if smooth is not None:
         parts = parts.smoothed(smooth)
     if scale != 1.0:
