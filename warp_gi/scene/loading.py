@@ -76,16 +76,19 @@ def _read(path: Path, suffix: str) -> SceneParts:
         from warp_gi.scene.files.obj import read_obj
 
         return read_obj(path)
+    if suffix == ".ply":
+        from warp_gi.scene.files.ply import read_ply
+
+        return read_ply(path)
     return _read_single_mesh(path, suffix)
 
 
 def _read_single_mesh(path: Path, suffix: str) -> SceneParts:
-    """Read a file that holds one mesh without materials: PLY, STL or OFF."""
+    """Read a file that holds one mesh without materials: STL or OFF."""
     from trimesh.exchange.load import mesh_loaders
 
-    options = {"skip_materials": True} if suffix == ".ply" else {}
     with path.open("rb") as file:
-        contents = mesh_loaders[suffix[1:]](file, file_type=suffix[1:], **options)
+        contents = mesh_loaders[suffix[1:]](file, file_type=suffix[1:])
     points, faces = contents.get("vertices"), contents.get("faces")
     if points is None or faces is None or not len(faces):
         raise SceneError(f"{str(path)!r} holds no triangles; export it with faces")

@@ -50,7 +50,9 @@ FEATURES: tuple[Feature, ...] = (
         ("KHR_lights_punctual", GLTF, "intensities are taken as W/sr and W/m², without conversion"),
         ("alphaMode MASK", GLTF, "rays pass where the coverage is below the cutoff"),
         ("perspective cameras", GLTF, "as they are"),
-        ("polygons", f"{OBJ}, {PLY}", "triangles"),
+        ("polygons, concave ones too", f"{OBJ}, {PLY}", "triangles: fans, or ear clipping of concave ones"),
+        ("MTL: Kd, Ks, Ns, Ke, d, Tr, Pr, Pm and their maps", OBJ, "metallic-roughness materials"),
+        ("textures named by a path of another machine", OBJ, "looked for by their bare names beside the MTL file"),
     ),
     *_features(
         "approximated",
@@ -59,6 +61,8 @@ FEATURES: tuple[Feature, ...] = (
         ("KHR_texture_transform", GLTF, "one transform for all textures of a material"),
         ("a second set of texture coordinates", GLTF, "one set for all textures of a material"),
         ("KHR_materials_variants", GLTF, "the materials without a variant"),
+        ("coverage between 0 and 1", OBJ, "a mask with a cutoff of 0.5"),
+        ("one scale and offset a map (-s, -o)", OBJ, "one for all maps of a material"),
         ("several animations", GLTF, "all at once; of those that move one property the first counts"),
     ),
     *_features(
@@ -92,6 +96,18 @@ FEATURES: tuple[Feature, ...] = (
         ("MSFT_lod", GLTF, "the most detailed level is shown"),
         ("EXT_lights_image_based", GLTF, "give a sky of its own"),
         ("KHR_audio_emitter", GLTF, "pictures have no sound"),
+        ("smoothing groups", OBJ, "faces without normals are flat; load_scene(smooth=) and --smooth make normals"),
+        ("faces of fewer than three corners", f"{OBJ}, {PLY}", "they have no area"),
+        ("free-form curves and surfaces", OBJ, "only polygons are read"),
+        ("bump and displacement maps", OBJ, "the surface without them; norm is a normal map"),
+        ("maps of the specular colour and exponent", OBJ, "the numbers beside them"),
+        ("reflection maps", OBJ, "reflections are computed"),
+        ("sheen, clear coats and anisotropy of MTL", OBJ, "the surface without them"),
+        ("glass of MTL (illum 4, 6, 7, 9)", OBJ, "opaque unless its coverage is below 0.5"),
+        ("spectral and XYZ colours", OBJ, "the colour is as if it were not given"),
+        ("triangle strips of PLY", PLY, "only faces are read"),
+        ("colours of faces", PLY, "only vertices have colours"),
+        ("textures of PLY", PLY, "the plain colour"),
         ("KHR_xmp_json_ld", GLTF, "a note about the file"),
     ),
     *_features(
@@ -112,6 +128,8 @@ class Findings:
 
     def __init__(self) -> None:
         self.places: dict[str, list[str]] = {}
+        self.lost: list[str] = []
+        """Messages about files that are not there, and without which the scene can be read."""
 
     def add(self, name: str, where: str = "") -> None:
         """Note that the file uses a feature in some place, such as "material 'paint'"."""
@@ -136,6 +154,8 @@ class Findings:
         return lines
 
     def warn(self, path: object, stacklevel: int = 2) -> None:
-        """Give one warning for each feature found, as from ``stacklevel`` calls above."""
+        """Give one warning for each feature found and for each file lost, as from ``stacklevel`` calls above."""
         for line in self.messages(path):
             warnings.warn(line, UnsupportedWarning, stacklevel=stacklevel + 1)
+        for line in self.lost:
+            warnings.warn(line, stacklevel=stacklevel + 1)
