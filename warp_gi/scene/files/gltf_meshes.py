@@ -65,16 +65,16 @@ class MeshReader:
         if any(weights):
             points, normals = self._morphed(source, owner, weights, points, normals)
         index = None if source.get("material") is None else document.whole(source, "material", owner)
-        mesh = Mesh(
+        self._note(attributes, owner)
+        return Mesh(
             points,
             _triangles(corners.astype(np.int64), mode),
             self.materials.material(index, owner),
             None if normals is None else np.ascontiguousarray(normals, np.float32),
             None if index is None else self._uvs(attributes, index, owner, len(points)),
             label,
+            colors=self._colors(attributes, owner, len(points)),
         )
-        self._note(attributes, owner)
-        return mesh
 
     def _attribute(
         self, attributes: Part, name: str, owner: str, count: int, widths: tuple[int, ...]
@@ -97,6 +97,16 @@ class MeshReader:
         uvs = uvs @ transform[:2, :2].T.astype(np.float32) + transform[:2, 2]
         return np.stack([uvs[:, 0], 1.0 - uvs[:, 1]], axis=1).astype(np.float32)
 
+    def _colors(self, attributes: Part, owner: str, count: int) -> np.ndarray | None:
+        """Return COLOR_0, linear, from 0 to 1; None if all of it is 1."""
+        colors = self._attribute(attributes, "COLOR_0", owner, count, (3, 4))
+        if colors is None:
+            return None
+        if colors.dtype.kind in "iu":  # glTF asks for normalized ones, and some writers forget to say so
+            colors = colors / np.float32(np.iinfo(colors.dtype.name).max)
+        colors = np.clip(np.nan_to_num(np.asarray(colors, np.float32), nan=1.0), 0.0, 1.0)
+        return None if (colors == 1.0).all() else np.ascontiguousarray(colors)
+
     def _morphed(
         self, source: Part, owner: str, weights: Sequence[float], points: np.ndarray, normals: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray | None]:
@@ -118,8 +128,6 @@ class MeshReader:
     def _note(self, attributes: Part, owner: str) -> None:
         """Note attributes that are not read."""
         findings = self.document.findings
-        if attributes.get("COLOR_0") is not None:
-            findings.add("COLOR_0", owner)
         if attributes.get("TANGENT") is not None:
             findings.add("tangents", owner)
         for name in attributes:

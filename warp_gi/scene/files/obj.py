@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_gi.color import decode_srgb
 from warp_gi.errors import SceneError
 from warp_gi.scene.files.images import find_file
 from warp_gi.scene.files.mtl import ELSEWHERE, MtlMaterial, MtlReader, read_mtl, unquoted
@@ -83,6 +84,7 @@ def _mesh(obj: ObjStatements, triangles: np.ndarray, reader: MtlReader, name: st
         normals,
         None if uvs is None else uvs.astype(np.float32),
         name or otherwise,
+        colors=None if obj.colors is None else decode_srgb(np.clip(obj.colors[vertex], 0.0, 1.0)).astype(np.float32),
     )
 
 

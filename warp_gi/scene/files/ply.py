@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from warp_gi.color import decode_srgb
 from warp_gi.errors import SceneError
 from warp_gi.scene.files.parts import SceneParts
 from warp_gi.scene.files.polygons import triangulate
@@ -261,14 +262,37 @@ def _mesh(
         corners, sizes = corners[np.repeat(~small, sizes)], sizes[~small]
     normals = vertices.columns(("nx", "ny", "nz"))
     uvs = next((one for one in map(vertices.columns, UV_NAMES) if one is not None), None)
+    colors = _colors(vertices, findings)
+    grey = (0.8, 0.8, 0.8) if colors is None else (1.0, 1.0, 1.0)
     return Mesh(
         np.ascontiguousarray(points, np.float32),
         corners[triangulate(points, corners, sizes)[0]].astype(np.int32),
-        Material(path.stem, specular=0.0),
+        Material(path.stem, grey, specular=0.0),
         None if normals is None else np.ascontiguousarray(normals, np.float32),
         None if uvs is None else np.ascontiguousarray(uvs, np.float32),
         path.stem,
+        colors=colors,
     )
+
+
+def _colors(vertices: Element, findings: Findings) -> np.ndarray | None:
+    """Return colours of vertices, linear; numbers in files are sRGB-coded, from 0 to the largest of their type.
+
+    Signed and 32-bit integers, and floats above 1, count from 0 to 255 where none is larger.
+    """
+    for names in COLOR_NAMES:
+        colors = vertices.columns(names)
+        if colors is None or not len(colors):
+            continue
+        kind = vertices.kind(names[0])
+        values, most = colors.astype(np.float64), float(np.nanmax(colors))
+        largest = 1.0 if kind[0] == "f" else float(np.iinfo(kind).max)
+        if most <= 255.0 and (kind in ("i2", "i4", "u4") or (kind[0] == "f" and most > 1.0)):
+            largest = 255.0
+        if "alpha" in vertices.values and (vertices.values["alpha"] < vertices.values["alpha"].max()).any():
+            findings.add("alpha of vertex colours")
+        return decode_srgb(np.clip(np.nan_to_num(values / largest), 0.0, 1.0)).astype(np.float32)
+    return None
 
 
 def _note(elements: list[Element], header: bytes, findings: Findings) -> None:
