@@ -16,6 +16,7 @@ _PUBLIC = {
     "SceneError": "warp_gi.errors",
     "OptionError": "warp_gi.errors",
     "BakeError": "warp_gi.errors",
+    "UnsupportedWarning": "warp_gi.errors",
     "Bake": "warp_gi.baking",
     "load_bake": "warp_gi.baking",
     "TriangleBvh": "warp_gi.bvh",

@@ -34,6 +34,7 @@ def load_scene(
             edges that bend more than this; None leaves them flat, as glTF asks.
         scale: Metres in one unit of the file. Radiance and intensities are left as they are.
 
+    Gives an UnsupportedWarning for each feature that the file uses and this library does not read in full.
     Raises SceneError if the file or anything it names is missing, damaged or unusable: one line.
     """
     path = Path(path)
@@ -56,6 +57,7 @@ def load_scene(
         raise SceneError(
             f"{str(path)!r} cannot be read as {kind} ({type(error).__name__}: {reason}); export or copy it again"
         ) from error
+    parts.findings.warn(path, stacklevel=2)
     if smooth is not None:
         parts = parts.smoothed(smooth)
     if scale != 1.0:
@@ -74,16 +76,19 @@ def _read(path: Path, suffix: str) -> SceneParts:
         from warp_gi.scene.files.obj import read_obj
 
         return read_obj(path)
+    if suffix == ".ply":
+        from warp_gi.scene.files.ply import read_ply
+
+        return read_ply(path)
     return _read_single_mesh(path, suffix)
 
 
 def _read_single_mesh(path: Path, suffix: str) -> SceneParts:
-    """Read a file that holds one mesh without materials: PLY, STL or OFF."""
+    """Read a file that holds one mesh without materials: STL or OFF."""
     from trimesh.exchange.load import mesh_loaders
 
-    options = {"skip_materials": True} if suffix == ".ply" else {}
     with path.open("rb") as file:
-        contents = mesh_loaders[suffix[1:]](file, file_type=suffix[1:], **options)
+        contents = mesh_loaders[suffix[1:]](file, file_type=suffix[1:])
     points, faces = contents.get("vertices"), contents.get("faces")
     if points is None or faces is None or not len(faces):
         raise SceneError(f"{str(path)!r} holds no triangles; export it with faces")

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from warp_gi.scene.files.support import Findings
 from warp_gi.scene.model import Mesh, Node, PunctualLight
 from warp_gi.scene.normals import smooth_mesh
 from warp_gi.scene.pinhole import Camera
@@ -19,6 +20,8 @@ class SceneParts:
     lights: list[PunctualLight] = field(default_factory=list)
     cameras: dict[str, Camera] = field(default_factory=dict)
     camera_nodes: dict[str, int] = field(default_factory=dict)
+    findings: Findings = field(default_factory=Findings)
+    """What the file uses and was not read in full."""
 
     def scaled(self, scale: float) -> SceneParts:
         """Return the parts with all lengths times ``scale``; intensities stay as they are."""
@@ -45,6 +48,7 @@ class SceneParts:
             [scaled_light(light) for light in self.lights],
             {name: scaled_camera(camera) for name, camera in self.cameras.items()},
             self.camera_nodes,
+            self.findings,
         )
 
     def smoothed(self, angle: float) -> SceneParts:
@@ -57,4 +61,4 @@ class SceneParts:
             return done[id(mesh)]
 
         nodes = [replace(node, meshes=[smoothed_mesh(mesh) for mesh in node.meshes]) for node in self.nodes]
-        return SceneParts(nodes, self.lights, self.cameras, self.camera_nodes)
+        return SceneParts(nodes, self.lights, self.cameras, self.camera_nodes, self.findings)
