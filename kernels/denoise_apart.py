@@ -17,6 +17,8 @@ from warp_gi.kernels.denoise import (
     saw_surface,
 )
 
+from warp_gi.kernels.denoise_edges import catmull_rom
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -69,6 +71,8 @@ def last_average(
     y0 = wp.int32(wp.floor(y))
     total = float(0.0)
     sums = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    low = wp.vec4(wp.inf, wp.inf, wp.inf, wp.inf)
+    high = wp.vec4(-wp.inf, -wp.inf, -wp.inf, -wp.inf)
     for k in range(4):
         px = x0 + k % 2
         py = y0 + k / 2
@@ -78,6 +82,16 @@ def last_average(
             if value[3] > 0.0:
                 total += w
                 sums += w * value
+                low = wp.min(low, value)
+                high = wp.max(high, value)
+    if total > 0.999 and x0 > 0 and y0 > 0 and x0 < settings.width - 2 and y0 < settings.height - 2:
+        sharp = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        for k in range(16):
+            column = k % 4 - 1
+            row = k / 4 - 1
+            w = catmull_rom(x - wp.float32(x0), column) * catmull_rom(y - wp.float32(y0), row)
+            sharp += w * last[(y0 + row) * settings.width + x0 + column]
+        return wp.min(wp.max(sharp, low), high)
     if total < LEAST_WEIGHT:
         return wp.vec4(0.0, 0.0, 0.0, 0.0)
     return sums / total

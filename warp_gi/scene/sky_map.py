@@ -18,6 +18,7 @@ from warp_gi.kernels import apart_lights
 from warp_gi.launch import on_device
 from warp_gi.scene import harmonics
 from warp_gi.scene.sky import node_solid_angles
+from warp_gi.scene.sun import LEAST_SHARE as ANY_SHARE
 from warp_gi.scene.sun import MapSplit, split_map
 from warp_gi.scene.watching import Watch
 
@@ -80,14 +81,16 @@ class SkyMap:
         """Spherical harmonics in the map's own space, float64 [3, order^2]."""
         return self.once(("harmonics", order), lambda pixels: harmonics.project(pixels, order))
 
-    def split(self, *limits: float) -> tuple[MapSplit, SkyMap]:
-        """Return the map's suns, and the map without them; ``limits`` are those of ``sun.split_map``."""
+    def split(
+        self, brighter_than: float, most: int, least_share: float = ANY_SHARE, widest: float = math.pi
+    ) -> tuple[MapSplit, SkyMap]:
+        """Return the map's suns, and the map without them; arguments are those of ``sun.split_map``."""
 
         def make(pixels: np.ndarray) -> tuple[MapSplit, SkyMap]:
-            parts = split_map(pixels, *limits)
+            parts = split_map(pixels, brighter_than, most, least_share, widest)
             return parts, self if parts.pixels is pixels else SkyMap(parts.pixels)
 
-        return self.once(("split", *limits), make)
+        return self.once(("split", brighter_than, most, least_share, widest), make)
 
     def sun_tables(self, device: wp.Device) -> SunTables | None:
         """Return the suns that are worth a ray, made once a device; None if there are none."""

@@ -89,8 +89,8 @@ def split_map(
         discs.append(disc)
     if not nodes:
         return none
-    share, lists = float(power / whole), (directions, irradiances, cones, discs)
-    return MapSplit(rest, *(np.array(values) for values in lists), share, tuple(nodes))
+    towards_suns, shapes = (np.array(directions), np.array(irradiances)), (np.array(cones), np.array(discs))
+    return MapSplit(rest, *towards_suns, *shapes, float(power / whole), tuple(nodes))
 
 
 def _blobs(rows: np.ndarray, columns: np.ndarray, height: int, width: int) -> np.ndarray:
