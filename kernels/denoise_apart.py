@@ -16,7 +16,6 @@ from warp_gi.kernels.denoise import (
     same_surface,
     saw_surface,
 )
-
 from warp_gi.kernels.denoise_edges import catmull_rom
 
 wp.set_module_options({"enable_backward": False})

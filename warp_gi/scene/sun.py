@@ -67,7 +67,8 @@ def split_map(
     down, right = math.pi / (height - 1), 2 * math.pi / width
     step = math.hypot(down, right)  # a texel's light reaches to the next, every way; near a pole less far
     spreads = (down**2 + (right * np.sin(theta)) ** 2) / 6  # of a texel's own light
-    directions, irradiances, cones, discs, nodes, power = [], [], [], [], [], 0.0
+    directions, irradiances, cones, discs, power = [], [], [], [], 0.0
+    nodes: list[np.ndarray] = []
     for k in suns:
         held = blobs == k
         weights = light[held] @ LUMINANCE
