@@ -50,8 +50,7 @@ class ApartData:
     suns: wp.array(dtype=Sun)
     nodes: wp.array(dtype=wp.int32)  # of the map, sun by sun
     sums: wp.array(dtype=wp.float32)  # [node] probability of a node of the sun up to this one
-    light_count: wp.int32
-    first_light: wp.int32  # emitters from this one on are those
+    light_count: wp.int32  # of emitters: all, if they are few and without size, or none
 
 
 @wp.func
@@ -65,13 +64,8 @@ def apart_is_sky(data: ApartData, light: wp.int32) -> wp.bool:
 
 
 @wp.func
-def apart_holds(data: ApartData, emitter: wp.int32) -> wp.bool:
-    return emitter >= data.first_light and emitter < data.first_light + data.light_count
-
-
-@wp.func
-def apart_holds_all(data: ApartData, scene: SceneData) -> wp.bool:
-    return data.light_count == scene.emitters.count
+def apart_holds_emitters(data: ApartData) -> wp.bool:
+    return data.light_count > 0
 
 
 # Radiance of suns at a place in a patch of nodes, and the density of samples of the one sun.
@@ -128,7 +122,7 @@ def sun_sample(data: ApartData, scene: SceneData, sun: Sun, u: wp.vec2) -> Light
 def apart_sample(data: ApartData, scene: SceneData, position: wp.vec3, light: wp.int32, u: wp.vec2) -> LightSample:
     if light < data.sun_count:
         return sun_sample(data, scene, data.suns[light], u)
-    return punctual_light(scene.emitters.emitters[data.first_light + light - data.sun_count], position)
+    return punctual_light(scene.emitters.emitters[light - data.sun_count], position)
 
 
 # Whether one of the four nodes of a patch is of a sun.
@@ -214,6 +208,6 @@ APART_LIGHTS = Sky(
     apart_sky_lookup,
     apart_sky_radiance,
     leave_no_record,
-    ApartLights(apart_count, apart_is_sky, apart_sample, apart_lookup, apart_holds, apart_holds_all),
+    ApartLights(apart_count, apart_is_sky, apart_sample, apart_lookup, apart_holds_emitters),
 )
 """The scene's sky and lights, with those apart that are far brighter than they are large."""

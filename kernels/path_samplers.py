@@ -77,8 +77,7 @@ class ApartLights(NamedTuple):
     is_sky: wp.Function  # (data, light) -> bool: whether it is a part of the sky, not an emitter
     sample: wp.Function  # (data, scene, position, light, u: vec2) -> LightSample; radiance over pdf
     lookup: wp.Function  # (data, scene, direction) -> EnvironmentLookup: of those in the sky alone
-    holds: wp.Function  # (data, emitter) -> bool: whether it is one of them
-    holds_all: wp.Function  # (data, scene) -> bool: whether every emitter is
+    holds_emitters: wp.Function  # (data) -> bool: whether all emitters are among them; if not, none is
 
 
 class Sky(NamedTuple):

@@ -274,7 +274,7 @@ def _made(
                 wants_sky = samples_sky and (paths.terms & TERM_ENVIRONMENT) != 0
                 wants_emitter = wants_emitter and (paths.terms & TERM_EMITTERS) != 0
                 if parts_lights:
-                    wants_emitter = wants_emitter and not apart.holds_all(samplers.sky, scene)
+                    wants_emitter = wants_emitter and not apart.holds_emitters(samplers.sky)
             elif u_select[0] < sky_share:
                 wants_emitter = False
             else:
@@ -362,10 +362,6 @@ def _made(
                         u_explore = explore_3d(index, seed, d)
                         choice = explore(samplers.lights, scene, region, s, wo, u_explore)
                         u_point = explore_2d(index, seed, d)
-                    if parts_lights:
-                        if at_first and choice.item >= 0:
-                            if apart.holds(samplers.sky, choice.item):
-                                choice.item = -1
                     if choice.item >= 0:
                         sample = connect_emitter(scene, s, wo, choice, u_point)
                         light = wp.vec3(0.0, 0.0, 0.0)

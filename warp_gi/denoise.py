@@ -147,8 +147,9 @@ class SpatioTemporal(Denoiser):
     """Samples a pixel, at least, of a frame without a frame before, 1 to 65536: the first one, a still, or after a cut.
     There is no average yet that would make up for few."""
     apart_frames: int = 4
-    """Most frames in the average of diffuse light from small suns of a sky and from up to four lights without size, 1
-    to 1024. Each gets a ray of its own, and its shadows are not filtered over pixels. 0 leaves it in other light."""
+    """Most frames in the average of diffuse light from small suns of a sky, and from lights without size if there are
+    at most four and no emissive surfaces; 1 to 1024. Each gets a ray of its own, and its shadows are not filtered
+    over pixels. 0 leaves it in other light."""
     edge_samples: int = 4
     """Camera samples of a pixel whose neighbours show something else, 0 to 64. They share the light of the pixels
     around, and cost no light samples. 0 takes none, and so do frames with as many camera samples in each pixel."""

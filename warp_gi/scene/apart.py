@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from warp_gi.scene.scene import Scene
 
 MOST_LIGHTS = 4
-"""Lights without size that get a ray each. Where there are more none does: one of them is selected."""
+"""Lights without size that get a ray each, if all emitters are. Where there are more, or surfaces that emit, one of all
+emitters is selected: by what it contributes, so that its light over its probability has little noise, which a selection
+among the others alone would not have."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +48,8 @@ def apart_lights_of(
         data.suns, data.nodes, data.sums = tables.suns, tables.nodes, tables.sums
         directions = tables.parts.directions @ rest.world_from_environment.T
         widths = np.arccos(tables.parts.cos_discs)
-    if of_emitters and not isinstance(scene, BakedScene) and len(scene.lights) <= MOST_LIGHTS:
-        data.light_count, data.first_light = len(scene.lights), scene.emitter_count - len(scene.lights)
+    if of_emitters and not isinstance(scene, BakedScene) and scene.emitter_count == len(scene.lights) <= MOST_LIGHTS:
+        data.light_count = len(scene.lights)
     if data.sun_count + data.light_count == 0:
         return None
     return ApartLights(data, directions, widths)
