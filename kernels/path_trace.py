@@ -131,6 +131,9 @@ def add_lobes(buffers: PathBuffers, pixel: wp.int32, s: Surface, r: PathRadiance
     incident = divided(r.diffuse, s.bsdf.diffuse, LEAST_REFLECTANCE)
     buffers.lobe_diffuse[pixel] = buffers.lobe_diffuse[pixel] + incident
     buffers.lobe_glossy[pixel] = buffers.lobe_glossy[pixel] + r.glossy
+    if buffers.lobe_apart.shape[0] > 0:
+        direct = divided(r.apart, s.bsdf.diffuse, LEAST_REFLECTANCE)
+        buffers.lobe_apart[pixel] = buffers.lobe_apart[pixel] + direct
 
 
 class PathTracer(NamedTuple):
@@ -511,9 +514,6 @@ def _made(
             indirect = indirect + r.indirect
             if paths.lobes != 0:
                 add_lobes(buffers, pixel, s, r)
-            if parts_lights:
-                incident = divided(r.apart, s.bsdf.diffuse, LEAST_REFLECTANCE)
-                buffers.lobe_apart[pixel] = buffers.lobe_apart[pixel] + incident
             beauty = emission + r.environment + r.emitters + r.indirect
             moment1 = moment1 + beauty
             moment2 = moment2 + wp.cw_mul(beauty, beauty)
