@@ -54,6 +54,7 @@ class NoisyLight:
     noisy: wp.array(dtype=wp.vec3)
     lobe_diffuse: wp.array(dtype=wp.vec3)  # incident
     lobe_glossy: wp.array(dtype=wp.vec3)
+    lobe_apart: wp.array(dtype=wp.vec3)  # incident, of lights that are apart
 
 
 # Light of a frame or an average over frames, [height * width].
@@ -157,6 +158,8 @@ def separate_light(first: wp.int32, settings: DenoiseSettings, light: NoisyLight
         incident = light.lobe_diffuse[i]
         glossy = light.lobe_glossy[i]
         rest = rest - wp.cw_mul(diffuse, incident) - glossy
+    if light.lobe_apart.shape[0] > 0:
+        rest = rest - wp.cw_mul(diffuse, light.lobe_apart[i])
     shared = divided(rest, diffuse + specular, LEAST_REFLECTANCE)
     a = known_light(incident + shared, diffuse)
     b = known_light(wp.cw_div(glossy + wp.cw_mul(specular, shared), glossy_scale(specular)), specular)

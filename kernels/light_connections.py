@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_gi.kernels.bsdf import bsdf_evaluate
 from warp_gi.kernels.bvh import bvh_occluded
-from warp_gi.kernels.emitters import LightChoice, sample_emitter
+from warp_gi.kernels.emitters import LightChoice, LightSample, sample_emitter
 from warp_gi.kernels.environment import EnvironmentSample, environment_arrival
 from warp_gi.kernels.sampling import (
     EXPLORE_DIGITS_DIMENSION,
@@ -68,9 +68,14 @@ def connect_sky(scene: SceneData, s: Surface, wo: wp.vec3, e: EnvironmentSample)
 
 @wp.func
 def connect_emitter(scene: SceneData, s: Surface, wo: wp.vec3, choice: LightChoice, u: wp.vec2) -> LightConnection:
-    r = LightConnection()
     origin = ray_origin(s)
-    e = sample_emitter(scene, origin, choice, u)
+    return connect_light(scene, s, wo, origin, sample_emitter(scene, origin, choice, u))
+
+
+# Whether a sample of a light, taken at `origin`, arrives.
+@wp.func
+def connect_light(scene: SceneData, s: Surface, wo: wp.vec3, origin: wp.vec3, e: LightSample) -> LightConnection:
+    r = LightConnection()
     if e.pdf <= 0.0 or wp.dot(e.direction, s.normal) <= 0.0:
         return r
     f = bsdf_evaluate(s.bsdf, wo, wp.transpose(s.shading) * e.direction)

@@ -44,6 +44,9 @@ EXPLORE_DIMENSION = wp.constant(12288)  # which other light to explore (random),
 EXPLORE_POINT_DIMENSION = wp.constant(12289)  # a pair for the point on it (random),
 EXPLORE_DIGITS_DIMENSION = wp.constant(2)  # and how far from that pair is another one, for the choice
 
+# Lights that have a ray of their own at the first vertex of a path: the point on it (2d), so many as there may be.
+APART_DIMENSION = wp.constant(2009)
+
 # Rays from pixels that end in light field probes, beside the path that may go on from where they end: its vertices
 # stay below, as it has BsdfPaths' default depth.
 PROBE_LOBE_DIMENSION = wp.constant(2000)

@@ -13,12 +13,13 @@ import warp as wp
 
 from warp_gi import launch
 from warp_gi.errors import OptionError, check_whole, one_line, unknown_name
-from warp_gi.kernels import denoise, denoise_edges
+from warp_gi.kernels import denoise, denoise_apart, denoise_edges
 from warp_gi.stateful import Ahead, Stateful
 
 if TYPE_CHECKING:
     from warp_gi.baking import Bake
     from warp_gi.frame import Frame
+    from warp_gi.scene.apart import ApartLights
     from warp_gi.scene.baked import BakedScene
     from warp_gi.scene.scene import Scene
 
@@ -43,6 +44,11 @@ class Denoiser(Stateful):
     wants_lobes: ClassVar[bool] = False
     """Whether ``apply`` reads the guides and the separated light (``Frame.lobes``)."""
 
+    @property
+    def parts_lights(self) -> bool:
+        """Whether it wants the diffuse light of suns and of lights without size apart (``Lobes.apart``)."""
+        return False
+
     def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
         """Return whether a frame depends on those before it; True, unless a denoiser promises that it does not."""
         return True
@@ -61,6 +67,16 @@ class Denoiser(Stateful):
 
 
 @dataclass(frozen=True)
+class ApartHistory:
+    """What ``SpatioTemporal`` keeps of the light of suns and of lights without size."""
+
+    average: wp.array
+    """Light and the number of frames in it, vec4 [height * width]."""
+    directions: np.ndarray
+    """Unit directions towards the suns, float64 [suns, 3]."""
+
+
+@dataclass(frozen=True)
 class History:
     """State of ``SpatioTemporal``: what it keeps of the last frame."""
 
@@ -74,6 +90,8 @@ class History:
     """Geometry and colours of the surfaces in the frame's pixels."""
     average: denoise.Signals
     """Averages over frames of diffuse and glossy light, and the number of frames in them."""
+    apart: ApartHistory | None = None
+    """Diffuse light of lights that are apart, if there are any."""
     picture: wp.array | None = None
     """The frame's beauty, vec3 [height * width], if pictures are averaged."""
 
@@ -87,10 +105,13 @@ class History:
         parts = {f"{name}": getattr(self.guides, name) for name in READ_GUIDES}
         parts |= {name: getattr(self.average, name) for name in launch.fields_of(denoise.Signals)}
         parts |= {} if self.picture is None else {"picture": self.picture}
+        parts |= {} if self.apart is None else {"apart": self.apart.average}
         frame = {
             "frame": np.array([self.index, *self.resolution]),
             "light": np.frombuffer(self.scene[1].encode(), np.uint8),
         }
+        if self.apart is not None:
+            frame["apart_directions"] = self.apart.directions
         return frame | {name: array.numpy() for name, array in parts.items()}
 
     def with_saved_arrays(self, arrays: Mapping[str, np.ndarray]) -> History:
@@ -102,12 +123,15 @@ class History:
             *((guides, n) for n in READ_GUIDES),
             *((average, n) for n in launch.fields_of(denoise.Signals)),
         ]:
-            setattr(struct, name, _loaded(arrays[name], getattr(struct, name), size[0] * size[1]))
-        picture = None
+            setattr(struct, name, _loaded(arrays[name], getattr(struct, name).dtype, size[0] * size[1], device))
+        picture, apart = None, None
         if "picture" in arrays:
-            picture = _loaded(arrays["picture"], average.diffuse, size[0] * size[1])
+            picture = _loaded(arrays["picture"], wp.vec3, size[0] * size[1], device)
+        if "apart" in arrays:
+            lights = _loaded(arrays["apart"], wp.vec4, size[0] * size[1], device)
+            apart = ApartHistory(lights, arrays["apart_directions"].reshape(-1, 3))
         light = arrays["light"].tobytes().decode("ascii")
-        return History(index, (size[0], size[1]), (self.scene[0], light), guides, average, picture)
+        return History(index, (size[0], size[1]), (self.scene[0], light), guides, average, apart, picture)
 
     def leads_to(self, frame: Frame) -> bool:
         """Return whether the frame's motion is towards the last frame, of the same scene and size."""
@@ -131,11 +155,11 @@ def _empty(struct: type[launch.Struct], device: wp.Device) -> launch.Struct:
     return empty
 
 
-def _loaded(array: np.ndarray, like: wp.array, count: int) -> wp.array:
-    """Return an array on the device of another one, with its type; raises ValueError unless it has ``count`` items."""
+def _loaded(array: np.ndarray, dtype: type, count: int, device: wp.Device) -> wp.array:
+    """Return an array on a device; raises ValueError unless it has ``count`` items."""
     if len(array) != count:
         raise ValueError(f"{len(array)} pixels instead of {count}")
-    return wp.array(array, dtype=like.dtype, device=like.device)
+    return wp.array(array, dtype=dtype, device=device)
 
 
 def light_of(scene: Scene | BakedScene) -> str:
@@ -181,6 +205,10 @@ class SpatioTemporal(Denoiser):
     first_samples: int = 4
     """Samples a pixel, at least, of a frame without a frame before, 1 to 65536: the first one, a still, or after a cut.
     There is no average yet that would make up for few."""
+    apart_frames: int = 4
+    """Most frames in the average of diffuse light from small suns of a sky, and from lights without size if there are
+    at most four and no emissive surfaces; 1 to 1024. Each gets a ray of its own, and its shadows are not filtered
+    over pixels. 0 leaves it in other light."""
     edge_samples: int = 4
     """Camera samples of a pixel whose neighbours show something else, 0 to 64. They share the light of the pixels
     around, and cost no light samples. 0 takes none, and so do frames with as many camera samples in each pixel."""
@@ -192,6 +220,7 @@ class SpatioTemporal(Denoiser):
         """Raise OptionError for settings out of range."""
         check_whole("first_samples", self.first_samples, 1, 1 << 16)
         check_whole("edge_samples", self.edge_samples, 0, 64)
+        check_whole("apart_frames", self.apart_frames, 0, 1024)
         if not 0 < self.blend <= 1:
             raise OptionError(f"blend must be a weight above 0 and at most 1, got {self.blend}")
         for name in ("frames", "glossy_frames"):
@@ -203,6 +232,11 @@ class SpatioTemporal(Denoiser):
                 raise OptionError(f"{name} must be above 0, got {getattr(self, name)}")
         if not 0 <= self.lag < math.inf:
             raise OptionError(f"lag must be 0 or a number of deviations above it, got {self.lag}")
+
+    @property
+    def parts_lights(self) -> bool:
+        """Whether there is an average of light that is apart."""
+        return self.apart_frames > 0
 
     @property
     def saves_state(self) -> bool:
@@ -227,6 +261,7 @@ class SpatioTemporal(Denoiser):
         if has_history:
             average = self._accumulated(frame, settings, state, guides, average)
         filtered = self._filtered(frame, settings, guides, average, 0 if has_history else 1)
+        apart = self._apart(frame, settings, state if has_history else None, guides, filtered)
         frame.launch(denoise.put_back, [light, guides, filtered, frame["beauty"]])
         edges = self._edges(frame)
         if edges.samples > 0:
@@ -238,7 +273,7 @@ class SpatioTemporal(Denoiser):
             frame.launch(denoise_edges.average_pictures, inputs)
         scene = (frame.scene, light_of(frame.scene))
         kept = wp.clone(frame["beauty"]) if self.blend < 1 else None  # whoever has the frame may write to it
-        return History(frame.index, frame.camera.resolution, scene, guides, average, kept)
+        return History(frame.index, frame.camera.resolution, scene, guides, average, apart, kept)
 
     def _accumulated(
         self,
@@ -284,6 +319,40 @@ class SpatioTemporal(Denoiser):
             light, spare = spare, light
             tells = wp.empty(0, dtype=wp.vec2, device=frame.device)
         return light
+
+    def _apart(
+        self,
+        frame: Frame,
+        settings: denoise.DenoiseSettings,
+        state: History | None,
+        guides: denoise.Guides,
+        filtered: denoise.Filtered,
+    ) -> ApartHistory | None:
+        """Add the light of lights that are apart to filtered diffuse light, and return the average over frames."""
+        lobes = frame.lobes()
+        if frame.apart is None or lobes is None or lobes.apart is None:
+            return None
+        light = denoise_apart.ApartLight()
+        light.noisy, light.frames = lobes.apart, self._apart_frames(frame.apart, state)
+        if state is not None and state.apart is not None:
+            light.last = state.apart.average
+        light.average = wp.empty(len(light.noisy), dtype=wp.vec4, device=frame.device)
+        before = guides if state is None else state.guides
+        frame.launch(denoise_apart.average_apart, [settings, guides, before, light, filtered])
+        return ApartHistory(light.average, frame.apart.directions)
+
+    def _apart_frames(self, lights: ApartLights, state: History | None) -> float:
+        """Return the most frames in the average of light that is apart.
+
+        Suns that move take their shadows along: so many frames are of use as they need to move by half their width.
+        Shadows of lights without size have no noise.
+        """
+        if state is None or state.apart is None or len(state.apart.directions) != len(lights.directions):
+            return 1.0
+        if len(lights.directions) == 0:
+            return 1.0
+        moved = np.linalg.norm(lights.directions - state.apart.directions, axis=1)
+        return min(max(float(np.min(lights.widths / np.maximum(2 * moved, 1e-9))), 1.0), float(self.apart_frames))
 
     def _settings(self, frame: Frame) -> denoise.DenoiseSettings:
         settings = denoise.DenoiseSettings()

@@ -22,7 +22,7 @@ from warp_gi.scene.watching import Change, Owner, Watch
 if TYPE_CHECKING:
     from warp_gi.kernels import types
     from warp_gi.scene.contents import SceneContents
-    from warp_gi.scene.environment import SkyMap
+    from warp_gi.scene.sky_map import SkyMap
 
 NEW_SCENE = "make a new scene: gi.Scene(scene.nodes, scene.lights, scene.environment, scene.cameras)"
 NEW_SKY = "assign it again: scene.environment = ..."

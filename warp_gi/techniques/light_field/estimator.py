@@ -274,7 +274,7 @@ class LightFieldProbes(Estimator, RadianceCache):
         buffers.indirect = frame["indirect"]
         buffers.moment1, buffers.moment2 = frame.moments("indirect")
         if (lobes := frame.lobes()) is not None:
-            buffers.diffuse, buffers.glossy = lobes
+            buffers.diffuse, buffers.glossy = lobes.diffuse, lobes.glossy
         data = lit_data(frame.scene, state.device)
         inputs = [data, frame.camera_data, settings, state.field, query, frame.hits, buffers]
         frame.launch_tiled(trace_kernels.trace_probes, inputs)
