@@ -498,9 +498,9 @@ def filter_level(
     y = i / settings.width
     x = i - y * settings.width
     variance = variance_around(settings, guides, light, i)
-    mine = telling(tells, light, i)
-    by_diffuse = 1.0 / (settings.luminance * wp.sqrt(variance[0]) + SMALLEST_DEVIATION * mine[0] + SMALLEST)
-    by_glossy = 1.0 / (settings.luminance * wp.sqrt(variance[1]) + SMALLEST_DEVIATION * mine[1] + SMALLEST)
+    mine = telling(tells, light, i)  # may be below 0, where one camera sample's colour met another one's light
+    by_diffuse = 1.0 / (settings.luminance * wp.sqrt(variance[0]) + SMALLEST_DEVIATION * wp.abs(mine[0]) + SMALLEST)
+    by_glossy = 1.0 / (settings.luminance * wp.sqrt(variance[1]) + SMALLEST_DEVIATION * wp.abs(mine[1]) + SMALLEST)
     by_plane = 1.0 / (settings.plane * settings.footprint * guides.guide_distance[i])
     d = light.diffuse[i]
     g = light.glossy[i]

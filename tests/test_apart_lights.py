@@ -16,7 +16,6 @@ from warp_gi.scene.sky_map import WIDEST
 
 CPU = wp.get_device("cpu")
 GREY = gi.Material("grey", (0.6, 0.5, 0.4), specular=0.0)
-GLOSSY = gi.Material("glossy", (0.6, 0.3, 0.2), roughness=0.25, specular=1.0)
 HEIGHT = 256
 NO_FILTER = {"levels": 0, "glossy_levels": 0, "edge_samples": 0, "first_samples": 1}
 
@@ -135,10 +134,18 @@ def test_sun_and_sky_are_the_integrals():
     assert z_test(mean, variance, others / np.pi, (2e-4 * others) ** 2, dof_a=11).passed, mean / (others / np.pi)
 
 
-@pytest.mark.parametrize("towards", [(0.02, 0.73, 0.68), (-0.5, 1.0, 0.6)], ids=["in the mirror", "beside it"])
-def test_glossy_light_of_suns_is_that_of_paths(towards):
+THETA = 60 * np.pi / (HEIGHT - 1)
+
+
+@pytest.mark.parametrize(
+    ("towards", "roughness"),
+    [((0.004, np.cos(THETA), np.sin(THETA)), 0.05), ((-0.5, 1.0, 0.6), 0.25)],
+    ids=["in the mirror", "beside it"],
+)
+def test_glossy_light_of_suns_is_that_of_paths(towards, roughness):
     """Half a sun in a coat whose lobe meets it, by light samples and by directions; and noise, lobes and moments."""
-    shot, camera = half_shaded(GLOSSY), at_the_origin(towards)
+    glossy = gi.Material("glossy", (0.6, 0.3, 0.2), roughness=roughness, specular=1.0)
+    shot, camera = half_shaded(glossy), at_the_origin(towards)
     frames = frames_of(shot, camera, pipeline(128))
     plain = frames_of(shot, camera, gi.Pipeline(spp=128, camera_samples=1, indirect=None), range(100, 112))
     light = lambda frame: frame.numpy("environment").mean(axis=(0, 1))  # noqa: E731

@@ -186,6 +186,15 @@ def test_variance_is_of_the_mean():
     assert short > 20
 
 
+def test_light_below_nothing_is_filtered_too():
+    """As it may be where camera samples differ in colour: what is shared out is then less than what was apart."""
+    light = np.full((H, W, 4), -0.5, np.float32)
+    light[..., 3] = 0.0
+    light[4, 5, :3] = -0.3
+    both = level_of(plane_guides(), light)
+    assert all(np.isfinite(one).all() and np.abs(one[..., :3] - light[..., :3]).max() < 1e-3 for one in both)
+
+
 @pytest.mark.parametrize("edge", ["normal", "depth"])
 def test_edges_do_not_leak(edge):
     guides = plane_guides()
