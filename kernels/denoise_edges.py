@@ -3,7 +3,9 @@
 A camera sample has colours, emission and geometry of its own, and shares the filtered light of the pixels around it. So
 it costs a ray and no light. The average over frames (temporal antialiasing) takes the last picture along the motion,
 limited to what the pixels around show now (Karis 2014, "High Quality Temporal Supersampling"), in linear values: in
-squashed ones bright light would be lost.
+squashed ones bright light would be lost. What shines by itself, lamps and the sky, stays out of it: it has no noise, and
+a lamp narrower than a pixel, hundreds of times as bright as the wall beside it, would light that wall up as the last
+picture moves by fractions of a pixel.
 """
 
 import warp as wp
@@ -34,6 +36,20 @@ class EdgeSettings:
     tent: wp.int32  # pixel filter, 1: tent, 0: box
     weight: wp.float32  # of a new picture in the average
     clip: wp.float32  # standard deviations of the pixels around, to which the last picture is limited
+
+
+# Pictures, [height * width]. Beauty is the light that surfaces reflect plus what shines by itself.
+@wp.struct
+class Picture:
+    beauty: wp.array(dtype=wp.vec3)
+    shining: wp.array(dtype=wp.vec3)  # emission, and the sky
+
+
+# What the primary saw at pixels' first camera samples, [height * width]: buffers of a frame.
+@wp.struct
+class Seen:
+    depth: wp.array(dtype=wp.float32)
+    motion: wp.array(dtype=wp.vec2)
 
 
 # Filtered light at a point.
@@ -147,7 +163,7 @@ def sample_edges(
     edges: EdgeSettings,
     guides: Guides,
     light: Filtered,
-    beauty: wp.array(dtype=wp.vec3),
+    picture: Picture,
 ):
     p = tiled_pixel(first + wp.tid(), camera.width)
     if p[0] >= camera.width or p[1] >= camera.height:
@@ -156,7 +172,8 @@ def sample_edges(
         return
     pixel = p[1] * camera.width + p[0]
     seed = hash_uint(edges.seed ^ wp.uint32(pixel))
-    total = wp.vec3(0.0, 0.0, 0.0)
+    reflected = wp.vec3(0.0, 0.0, 0.0)
+    shining = wp.vec3(0.0, 0.0, 0.0)
     count = float(0.0)
     for k in range(edges.samples):
         u = sample_2d(wp.uint32(k), seed, CAMERA_DIMENSION)
@@ -165,18 +182,19 @@ def sample_edges(
         direction = camera_ray(camera, px, py)
         hit = bvh_intersect(scene.bvh, camera.position, direction, float(wp.inf))
         if hit.face < 0:
-            total += environment_radiance(scene.environment, direction)
+            shining += environment_radiance(scene.environment, direction)
             count += 1.0
         else:
             s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
             known = shared_light(settings, guides, light, s, hit.t, px, py)
             if known.seen:
-                lit = wp.cw_mul(s.bsdf.diffuse, known.diffuse)
-                lit += wp.cw_mul(glossy_scale(average_specular(s.bsdf)), known.glossy)
-                total += lit + surface_emission(scene, hit.face, hit.u, hit.v, -direction)
+                reflected += wp.cw_mul(s.bsdf.diffuse, known.diffuse)
+                reflected += wp.cw_mul(glossy_scale(average_specular(s.bsdf)), known.glossy)
+                shining += surface_emission(scene, hit.face, hit.u, hit.v, -direction)
                 count += 1.0
     if count > 0.0:
-        beauty[pixel] = total / count
+        picture.beauty[pixel] = (reflected + shining) / count
+        picture.shining[pixel] = shining / count
 
 
 # Value of a picture at coordinates in units of pixels from the first pixel's middle: Catmull-Rom, within the range of
@@ -215,19 +233,25 @@ def catmull_rom(f: wp.float32, number: wp.int32) -> wp.float32:
     return f * f * (-0.5 + 0.5 * f)
 
 
-# Thread: a pixel. Averages the picture with the last one, which moves as the nearest of the surfaces around does.
+# Thread: a pixel. Averages reflected light with that of the last picture, which moves as the nearest of the surfaces
+# around does. Writes the beauty, and the reflected light for the next frame. Of a weight of 1 there is no last picture.
 @wp.kernel
 def average_pictures(
     first: wp.int32,
     settings: DenoiseSettings,
     edges: EdgeSettings,
-    depth: wp.array(dtype=wp.float32),
-    motion: wp.array(dtype=wp.vec2),
-    picture: wp.array(dtype=wp.vec3),
+    seen: Seen,
+    picture: Picture,
     last: wp.array(dtype=wp.vec3),
-    out: wp.array(dtype=wp.vec3),
+    kept: wp.array(dtype=wp.vec3),
+    beauty: wp.array(dtype=wp.vec3),
 ):
     i = first + wp.tid()
+    own = picture.beauty[i] - picture.shining[i]
+    kept[i] = own
+    beauty[i] = picture.beauty[i]
+    if edges.weight >= 1.0:
+        return
     y = i / settings.width
     x = i - y * settings.width
     nearest = int(i)
@@ -239,19 +263,20 @@ def average_pictures(
         ty = y + k / 3 - 1
         if tx >= 0 and tx < settings.width and ty >= 0 and ty < settings.height:
             j = ty * settings.width + tx
-            if depth[j] < depth[nearest]:
+            if seen.depth[j] < seen.depth[nearest]:
                 nearest = j
-            total += picture[j]
-            squares += wp.cw_mul(picture[j], picture[j])
+            light = picture.beauty[j] - picture.shining[j]
+            total += light
+            squares += wp.cw_mul(light, light)
             count += 1.0
-    px = wp.float32(x) + motion[nearest][0]
-    py = wp.float32(y) + motion[nearest][1]
+    px = wp.float32(x) + seen.motion[nearest][0]
+    py = wp.float32(y) + seen.motion[nearest][1]
     inside = px >= 0.0 and px <= wp.float32(settings.width - 1) and py >= 0.0 and py <= wp.float32(settings.height - 1)
-    out[i] = picture[i]
     if inside:
         mean = total / count
         spread = wp.max(squares / count - wp.cw_mul(mean, mean), wp.vec3(0.0, 0.0, 0.0))
         margin = edges.clip * wp.vec3(wp.sqrt(spread[0]), wp.sqrt(spread[1]), wp.sqrt(spread[2]))
         before = sharp_value(last, settings.width, settings.height, px, py)
         before = wp.min(wp.max(before, mean - margin), mean + margin)
-        out[i] = before * (1.0 - edges.weight) + picture[i] * edges.weight
+        kept[i] = before * (1.0 - edges.weight) + own * edges.weight
+        beauty[i] = kept[i] + picture.shining[i]

@@ -497,19 +497,20 @@ def test_edges_show_the_sky_and_what_emits():
     assert share.mean() == pytest.approx(0.5, abs=0.1)
 
 
-def averaged(picture, last, motion, depth=None, **changes):
+def averaged(picture, last, motion, depth=None, shining=None, **changes):
     """What ``average_pictures`` makes of pictures [height, width, 3] and a motion [height, width, 2]."""
+    vectors = lambda a: wp.array(a.reshape(H * W, 3).astype(np.float32), dtype=wp.vec3, device=CPU)  # noqa: E731
     edges = denoise_edges.EdgeSettings()
     edges.weight, edges.clip = changes.get("weight", 0.25), changes.get("clip", 1e6)
-    arrays = [np.ones((H, W), np.float32) if depth is None else depth, motion, picture, last]
-    kinds = [wp.float32, wp.vec2, wp.vec3, wp.vec3]
-    inputs = [
-        wp.array(a.reshape(H * W, *a.shape[2:]).astype(np.float32), dtype=kind, device=CPU)
-        for a, kind in zip(arrays, kinds, strict=True)
-    ]
-    out = wp.zeros(H * W, dtype=wp.vec3, device=CPU)
-    launch.launch(denoise_edges.average_pictures, H * W, [settings_of(), edges, *inputs, out], CPU)
-    return image(out, H, W)
+    depth = np.ones((H, W), np.float32) if depth is None else depth
+    seen = filled(denoise_edges.Seen, depth=depth, motion=motion.astype(np.float32))
+    shining = np.zeros_like(picture) if shining is None else shining
+    both = filled(denoise_edges.Picture, beauty=picture.astype(np.float32), shining=shining.astype(np.float32))
+    kept, beauty = (wp.zeros(H * W, dtype=wp.vec3, device=CPU) for _ in range(2))
+    inputs = [settings_of(), edges, seen, both, vectors(last), kept, beauty]
+    launch.launch(denoise_edges.average_pictures, H * W, inputs, CPU)
+    np.testing.assert_allclose(image(kept, H, W), image(beauty, H, W) - shining, rtol=1e-4, atol=1e-4)
+    return image(beauty, H, W)
 
 
 def test_the_last_picture_moves_along():
@@ -532,6 +533,28 @@ def test_the_last_picture_is_limited_to_what_is_around():
         near = picture[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2].reshape(-1, 3)
         expected = 0.25 * picture[y, x] + 0.75 * (near.mean(0) + 1.5 * near.std(0))
         np.testing.assert_allclose(result[y, x], expected, rtol=1e-3)
+
+
+def test_what_shines_by_itself_is_in_no_average_of_pictures():
+    """A lamp of 90 beside walls of 0.1 that moves by half a pixel a frame: it is where it is, and walls stay dark."""
+    picture, shining = np.full((H, W, 3), 0.1), np.zeros((H, W, 3))
+    shining[5, 7] = 90.0
+    motion = np.broadcast_to([0.5, 0.0], (H, W, 2))
+    result = averaged(picture + shining, np.full((H, W, 3), 0.1), motion, shining=shining, clip=1.5)
+    np.testing.assert_allclose(result, picture + shining, rtol=1e-4)
+    assert averaged(picture + shining, picture + shining, motion, clip=1.5)[5, 6].min() > 5
+
+
+def test_lamps_do_not_light_the_average_of_pictures():
+    """Lamps a tenth of a pixel to a pixel wide before a black wall: no light beside them, whatever the camera's way."""
+    lamps = [card(0.0, 0.008 * (1 + i), gi.Material("lamp", (0, 0, 0), emission=(90.0, 60.0, 30.0))) for i in range(6)]
+    nodes = [gi.Node(f"lamp {i}", [lamp], translation=(0.4 * i - 1.0, 0, 0)) for i, lamp in enumerate(lamps)]
+    shot, mean = gi.Scene(nodes), {}
+    for blend in (1.0, 0.25):
+        scheduler = gi.FrameScheduler(shot, sideways(0.7), gi.Pipeline(spp=1, denoise=SpatioTemporal(blend=blend)))
+        mean[blend] = [scheduler.frame(index).numpy("beauty") for index in range(6)]
+    np.testing.assert_allclose(mean[0.25], mean[1.0], rtol=1e-4, atol=1e-4)
+    assert np.max(mean[1.0]) > 10
 
 
 def test_a_picture_that_is_written_to_is_not_that_which_is_averaged():

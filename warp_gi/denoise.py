@@ -73,7 +73,7 @@ class History:
     average: denoise.Signals
     """Averages over frames of diffuse and glossy light, and the number of frames in them."""
     picture: wp.array | None
-    """The frame's beauty, vec3 [height * width], if pictures are averaged."""
+    """Average of the reflected light of pictures, vec3 [height * width], if pictures are averaged."""
 
     def leads_to(self, frame: Frame) -> bool:
         """Return whether the frame's motion is towards the last frame, of the same scene and size."""
@@ -166,17 +166,9 @@ class SpatioTemporal(Denoiser):
             average = self._accumulated(frame, settings, state, guides, average)
         filtered = self._filtered(frame, settings, guides, average, 0 if has_history else 1)
         frame.launch(denoise.put_back, [light, guides, filtered, frame["beauty"]])
-        edges = self._edges(frame)
-        if edges.samples > 0:
-            inputs = [frame.data, frame.camera_data, settings, edges, guides, filtered, frame["beauty"]]
-            frame.launch_tiled(denoise_edges.sample_edges, inputs)
-        if state is not None and has_history and state.picture is not None:
-            picture = wp.clone(frame["beauty"])
-            inputs = [settings, edges, frame["depth"], frame["motion"], picture, state.picture, frame["beauty"]]
-            frame.launch(denoise_edges.average_pictures, inputs)
+        picture = self._finished(frame, settings, guides, filtered, state.picture if state and has_history else None)
         scene = (frame.scene, light_of(frame.scene))
-        kept = wp.clone(frame["beauty"]) if self.blend < 1 else None  # whoever has the frame may write to it
-        return History(frame.index, frame.camera.resolution, scene, guides, average, kept)
+        return History(frame.index, frame.camera.resolution, scene, guides, average, picture)
 
     def _accumulated(
         self,
@@ -222,6 +214,29 @@ class SpatioTemporal(Denoiser):
             light, spare = spare, light
             tells = wp.empty(0, dtype=wp.vec2, device=frame.device)
         return light
+
+    def _finished(
+        self,
+        frame: Frame,
+        settings: denoise.DenoiseSettings,
+        guides: denoise.Guides,
+        filtered: denoise.Filtered,
+        last: wp.array | None,
+    ) -> wp.array | None:
+        """Give the beauty more camera samples and average it with the last one; return what to keep of it."""
+        edges, picture = self._edges(frame), frame.struct(denoise_edges.Picture)
+        picture.shining = wp.clone(frame["emission"])
+        if edges.samples > 0:
+            inputs = [frame.data, frame.camera_data, settings, edges, guides, filtered, picture]
+            frame.launch_tiled(denoise_edges.sample_edges, inputs)
+        if self.blend == 1:
+            return None
+        if last is None:
+            edges.weight, last = 1.0, wp.empty(0, dtype=wp.vec3, device=frame.device)
+        picture.beauty, kept = wp.clone(frame["beauty"]), wp.empty_like(frame["beauty"])
+        inputs = [settings, edges, frame.struct(denoise_edges.Seen), picture, last, kept, frame["beauty"]]
+        frame.launch(denoise_edges.average_pictures, inputs)
+        return kept
 
     def _settings(self, frame: Frame) -> denoise.DenoiseSettings:
         settings = denoise.DenoiseSettings()
