@@ -93,7 +93,7 @@ class History:
     apart: ApartHistory | None = None
     """Diffuse light of lights that are apart, if there are any."""
     picture: wp.array | None = None
-    """The frame's beauty, vec3 [height * width], if pictures are averaged."""
+    """Average of the reflected light of pictures, vec3 [height * width], if pictures are averaged."""
 
     @staticmethod
     def empty(scene: Scene | BakedScene, device: wp.Device) -> History:
@@ -210,11 +210,12 @@ class SpatioTemporal(Denoiser):
     at most four and no emissive surfaces; 1 to 1024. Each gets a ray of its own, and its shadows are not filtered
     over pixels. 0 leaves it in other light."""
     edge_samples: int = 4
-    """Camera samples of a pixel whose neighbours show something else, 0 to 64. They share the light of the pixels
-    around, and cost no light samples. 0 takes none, and so do frames with as many camera samples in each pixel."""
-    blend: float = 1.0
-    """Weight of a frame in the average of pictures, above 0 to 1 (temporal antialiasing): 0.25 flickers less and is
-    softer; 1 is no average."""
+    """Camera samples of a pixel whose neighbours show something else, its own among them, 0 to 64. They share the light
+    of the pixels around, and cost no light samples. Where neighbours are of one surface and only their colours differ,
+    two thirds of the further samples are taken. Frames that have as many in each pixel take no more."""
+    blend: float = 0.25
+    """Weight of a frame in the average of pictures, above 0 to 1 (temporal antialiasing). Smaller ones flicker less and
+    are softer; 1 is no average."""
 
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
@@ -254,26 +255,19 @@ class SpatioTemporal(Denoiser):
 
     def apply(self, frame: Frame, state: History) -> History:
         """Fill ``frame["beauty"]``; the state is the last frame's History."""
-        light, guides = frame.struct(denoise.NoisyLight), frame.struct(denoise.Guides)
+        light, guides, changes = frame.struct(denoise.NoisyLight), frame.struct(denoise.Guides), None
         settings, average = self._settings(frame), self._signals(frame)
         frame.launch(denoise.separate_light, [settings, light, guides, average])
         has_history = state.leads_to(frame)
         if has_history:
-            average = self._accumulated(frame, settings, state, guides, average)
+            average, changes = self._accumulated(frame, settings, state, guides, average)
         filtered = self._filtered(frame, settings, guides, average, 0 if has_history else 1)
         apart = self._apart(frame, settings, state if has_history else None, guides, filtered)
         frame.launch(denoise.put_back, [light, guides, filtered, frame["beauty"]])
-        edges = self._edges(frame)
-        if edges.samples > 0:
-            inputs = [frame.data, frame.camera_data, settings, edges, guides, filtered, frame["beauty"]]
-            frame.launch_tiled(denoise_edges.sample_edges, inputs)
-        if has_history and state.picture is not None:
-            picture = wp.clone(frame["beauty"])
-            inputs = [settings, edges, frame["depth"], frame["motion"], picture, state.picture, frame["beauty"]]
-            frame.launch(denoise_edges.average_pictures, inputs)
+        last = state.picture if has_history else None
+        picture = self._finished(frame, settings, guides, filtered, changes, last)
         scene = (frame.scene, light_of(frame.scene))
-        kept = wp.clone(frame["beauty"]) if self.blend < 1 else None  # whoever has the frame may write to it
-        return History(frame.index, frame.camera.resolution, scene, guides, average, apart, kept)
+        return History(frame.index, frame.camera.resolution, scene, guides, average, apart, picture)
 
     def _accumulated(
         self,
@@ -282,8 +276,8 @@ class SpatioTemporal(Denoiser):
         state: History,
         guides: denoise.Guides,
         noisy: denoise.Signals,
-    ) -> denoise.Signals:
-        """Return the average over frames with this one in it."""
+    ) -> tuple[denoise.Signals, denoise.Changes | None]:
+        """Return the average over frames with this one in it, and where light has changed, unless nothing asks."""
         average, changes = self._signals(frame), denoise.Changes()
         frame.launch(denoise.reproject, [settings, guides, state.guides, state.average, average])
         columns, rows = (math.ceil(size / int(denoise.BLOCK)) for size in frame.camera.resolution)
@@ -293,7 +287,7 @@ class SpatioTemporal(Denoiser):
         if self.lag > 0:
             frame.launch(denoise.find_changes, [settings, noisy, average, changes], columns * rows)
         frame.launch(denoise.add_frame, [settings, noisy, average, changes, average])
-        return average
+        return average, changes if self.lag > 0 else None
 
     def _filtered(
         self,
@@ -354,6 +348,42 @@ class SpatioTemporal(Denoiser):
         moved = np.linalg.norm(lights.directions - state.apart.directions, axis=1)
         return min(max(float(np.min(lights.widths / np.maximum(2 * moved, 1e-9))), 1.0), float(self.apart_frames))
 
+    def _finished(
+        self,
+        frame: Frame,
+        settings: denoise.DenoiseSettings,
+        guides: denoise.Guides,
+        filtered: denoise.Filtered,
+        changes: denoise.Changes | None,
+        last: wp.array | None,
+    ) -> wp.array | None:
+        """Give the beauty more camera samples and average it with the last one; return what to keep of it."""
+        edges, picture = self._edges(frame), frame.struct(denoise_edges.Picture)
+        picture.shining = wp.clone(frame["emission"])
+        picture.less = wp.zeros_like(frame["depth"])
+        if changes is not None and last is not None:
+            frame.launch(denoise_edges.mark_changes, [settings, changes, picture.less])
+        if edges.samples > 0:
+            inputs = [frame.data, frame.camera_data, settings, edges, guides, filtered, picture]
+            frame.launch_tiled(denoise_edges.sample_edges, inputs)
+        return self._averaged(frame, settings, edges, picture, last) if self.blend < 1 else None
+
+    def _averaged(
+        self,
+        frame: Frame,
+        settings: denoise.DenoiseSettings,
+        edges: denoise_edges.EdgeSettings,
+        picture: denoise_edges.Picture,
+        last: wp.array | None,
+    ) -> wp.array:
+        """Average the beauty with the last picture; return its reflected light, which is the next frame's last one."""
+        if last is None:
+            edges.weight, last = 1.0, wp.empty(0, dtype=wp.vec3, device=frame.device)
+        picture.beauty, kept = wp.clone(frame["beauty"]), wp.empty_like(frame["beauty"])
+        inputs = [settings, edges, frame.struct(denoise_edges.Seen), picture, last, kept, frame["beauty"]]
+        frame.launch(denoise_edges.average_pictures, inputs)
+        return kept
+
     def _settings(self, frame: Frame) -> denoise.DenoiseSettings:
         settings = denoise.DenoiseSettings()
         settings.width, settings.height = frame.camera.resolution
@@ -368,6 +398,7 @@ class SpatioTemporal(Denoiser):
     def _edges(self, frame: Frame) -> denoise_edges.EdgeSettings:
         edges = denoise_edges.EdgeSettings()
         few = frame.settings.camera_samples < self.edge_samples
+        edges.own = int(frame.settings.camera_samples == 1)
         edges.samples = self.edge_samples if frame.has_camera_rays and few else 0
         edges.seed, edges.tent = frame.seed, int(frame.settings.filter == "tent")
         edges.weight, edges.clip = self.blend, CLIP
