@@ -79,12 +79,14 @@ def test_kernels_keep_their_form(path):
 
 @pytest.mark.parametrize("path", KERNELS, ids=_relative)
 def test_locals_of_device_code_are_not_named_as_constants_of_warp(path):
-    """Warp takes `e.pdf` for Euler's number until `e` was compiled: a module's hash then depends on what came before."""
+    """Warp takes `e.pdf` for Euler's number until `e` was compiled: a hash then depends on what was compiled before."""
     for function in ast.walk(ast.parse(path.read_text())):
         if not isinstance(function, ast.FunctionDef):
             continue
         stored = {n.id for n in ast.walk(function) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
-        read = {n.value.id for n in ast.walk(function) if isinstance(n, ast.Attribute) and isinstance(n.value, ast.Name)}
+        read = {
+            n.value.id for n in ast.walk(function) if isinstance(n, ast.Attribute) and isinstance(n.value, ast.Name)
+        }
         own = (stored | {argument.arg for argument in function.args.args}) & read
         taken = {name for name in own if isinstance(getattr(wp, name, None), (int, float))}
         assert not taken, f"{function.name}: rename {taken}"

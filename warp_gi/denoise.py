@@ -151,6 +151,11 @@ class SpatioTemporal(Denoiser):
         if not 0 <= self.lag < math.inf:
             raise OptionError(f"lag must be 0 or a number of deviations above it, got {self.lag}")
 
+    def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
+        """Return the kernels of the filter, and of edges."""
+        edges = (denoise_edges.sample_edges,) if self.edge_samples or self.blend < 1 else ()
+        return (denoise.separate_light, *edges)
+
     def samples(self, frame: Frame, state: History | None) -> int:
         """Return ``first_samples`` at least for a frame that no frame leads to."""
         has_history = state is not None and state.leads_to(frame)

@@ -6,8 +6,10 @@ from collections.abc import Callable, Container, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from warp_gi import launch
 from warp_gi.errors import OptionError
 from warp_gi.estimator import Estimator
+from warp_gi.foretold import kernels_of
 from warp_gi.pipeline import Pipeline
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.sky_motion import sky_start
@@ -75,6 +77,7 @@ def render(
         raise OptionError('resume, precision, preview and exposure are of files; give output="out/shot.####.exr" too')
     wanted = _frame_numbers(camera, frames)
     scheduler = FrameScheduler(scene, camera, pipeline or Pipeline(), device, seed, progress, bakes)
+    launch.load_ahead(kernels_of(scheduler.pipeline, scheduler.scene), scheduler.device)
     if output is None:
         for position, index in enumerate(wanted):
             if index not in skip:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 if TYPE_CHECKING:
+    import warp as wp
+
     from warp_gi.baking import Bake, Setting
     from warp_gi.frame import Frame
     from warp_gi.scene.baked import BakedScene
@@ -64,6 +66,17 @@ class Stateful:
 
         A field of the pipeline that holds a service of the same name replaces its settings.
         """
+        return ()
+
+    def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
+        """Return a kernel of each module that this will launch: modules then compile before they are waited for.
+
+        ``scene`` None is not known yet. A module left out compiles at its first launch; one too many costs its time.
+        """
+        return ()
+
+    def samplers(self, scene: Scene | BakedScene | None = None) -> tuple[Any, ...]:
+        """Return the samplers of ``kernels.path_samplers`` that this will give to paths, as they are compiled in."""
         return ()
 
     # ---- before the first frame ----

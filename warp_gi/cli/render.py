@@ -27,6 +27,7 @@ from warp_gi.cli.pipelines import find_denoiser, pipeline_named, with_settings_s
 from warp_gi.cli.report import Reporter, run_command
 from warp_gi.errors import OptionError
 from warp_gi.files import check_writable
+from warp_gi.foretold import kernels_of
 from warp_gi.frame import Frame
 from warp_gi.pipeline import Pipeline
 from warp_gi.scene.baked import BakedScene
@@ -127,11 +128,14 @@ def run(options: Render, report: Reporter) -> None:
         raise OptionError("--reuse-pixel goes with --reuse-pictures; give that too")
     resolution = parse_resolution(options.resolution) if options.resolution else None
     bakes = [load_bake(path) for path in options.bake]
+    device = launch.get_device(options.device)
+    launch.load_ahead(kernels_of(options.settings), device)
     with report.phase("scene"):
         scene = BakedScene(load_bake(options.scene)) if options.scene.endswith(BAKE_SUFFIX) else find_scene(options)
         camera = find_camera(options, scene, report)
     if resolution:
         camera = camera.at_resolution(*resolution)
+    launch.load_ahead(kernels_of(options.settings, scene), device)
     describe(options, scene, report)
     shots = find_shots(options, camera)
     if isinstance(scene, Scene):

@@ -16,6 +16,7 @@ from warp_gi.errors import OptionError, unknown_name
 from warp_gi.estimator import Ahead, Estimator
 from warp_gi.kernels import harmonics as harmonics_kernels
 from warp_gi.kernels import visibility_field as field_kernels
+from warp_gi.kernels import visibility_field_bake as bake_kernels
 from warp_gi.kernels import visibility_field_trace as trace_kernels
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.camera import Camera, CameraPath
@@ -164,6 +165,13 @@ class VisibilityField(Estimator):
         return FieldState.from_bake(scene, target, self.mask_settings, seed, bake)
 
     # ---- frames ----
+
+    def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
+        """Return the kernels of cells and of their light."""
+        return (
+            bake_kernels.find_cells,
+            trace_kernels.trace_field,
+        )
 
     @property
     def saves_state(self) -> bool:
