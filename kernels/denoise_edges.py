@@ -17,7 +17,7 @@ from warp_gi.kernels.sampling import CAMERA_DIMENSION, filter_offset, hash_uint,
 from warp_gi.kernels.surface import Surface, shading_normal, surface_at, surface_emission
 from warp_gi.kernels.types import SceneData
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 4})  # compiles in less than two thirds, and is as fast
 
 LEAST_COSINE = wp.constant(wp.float32(0.9))  # between normals of pixels that do not differ
 MOST_FOOTPRINTS = wp.constant(wp.float32(2.0))  # between a pixel's plane and a point of one that does not differ
