@@ -10,6 +10,7 @@ from warp_gi import launch
 from warp_gi.errors import OptionError
 from warp_gi.estimator import Estimator
 from warp_gi.foretold import kernels_of
+from warp_gi.kept import BakeFolder, cached_bake
 from warp_gi.pipeline import Pipeline
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.sky_motion import sky_start
@@ -41,6 +42,7 @@ def render(
     precision: Literal["half", "float"] = "half",
     preview: bool = False,
     exposure: float = 0.0,
+    cache: BakeFolder | str | Path | None = None,
 ) -> Iterator[Frame]:
     """Yield the frames of a sequence, and write them to files if there is an ``output``.
 
@@ -68,6 +70,8 @@ def render(
         precision: Storage of colours and normals in EXR files: "half" or "float".
         preview: Write a tone-mapped PNG beside each EXR file.
         exposure: Exposure of PNG files in stops.
+        cache: Folder in which bakes that take long are kept, and found the next time, or a ``gi.BakeFolder``, which the
+            command uses. The frames are the same to the last bit. None keeps none.
 
     Raises OptionError for a device that is not there, a negative frame or seed, files that frames cannot be, several
     frames for one file; BakeError for a bake of another scene or other settings; SceneError for a scene that was
@@ -76,7 +80,7 @@ def render(
     if output is None and (resume or preview or exposure or precision != "half"):
         raise OptionError('resume, precision, preview and exposure are of files; give output="out/shot.####.exr" too')
     wanted = _frame_numbers(camera, frames)
-    scheduler = FrameScheduler(scene, camera, pipeline or Pipeline(), device, seed, progress, bakes)
+    scheduler = FrameScheduler(scene, camera, pipeline or Pipeline(), device, seed, progress, bakes, cache)
     launch.load_ahead(kernels_of(scheduler.pipeline, scheduler.scene), scheduler.device)
     if output is None:
         for position, index in enumerate(wanted):
@@ -109,6 +113,7 @@ def plan_sequence(
     *,
     output: str | Path,
     precision: Literal["half", "float"] = "half",
+    cache: BakeFolder | str | Path | None = None,
 ) -> Plan:
     """Return what ``render`` with these arguments and ``resume=True`` would render, and why; nothing is written.
 
@@ -118,7 +123,7 @@ def plan_sequence(
     the scene is left under the sky of the last frame.
     """
     wanted = _frame_numbers(camera, frames)
-    scheduler = FrameScheduler(scene, camera, pipeline or Pipeline(), device, seed, progress, bakes)
+    scheduler = FrameScheduler(scene, camera, pipeline or Pipeline(), device, seed, progress, bakes, cache)
     files = Output(Path(output), precision)
     shots = shots_of(camera, wanted, files.pattern)
     return SequenceRun(scheduler, shots, files).plan() if shots else Plan((), ())
@@ -133,6 +138,7 @@ def bake(
     progress: Progress | None = None,
     *,
     camera_path: Camera | CameraPath | None = None,
+    cache: BakeFolder | str | Path | None = None,
 ) -> Bake:
     """Return what an estimator can know of a scene before the first frame, to be saved and used again.
 
@@ -145,6 +151,7 @@ def bake(
         camera: Where the scene will be seen from, for estimators that bake no more than that; None is everywhere.
         progress: Called with (stage, share done in [0, 1]).
         camera_path: Another name of ``camera``.
+        cache: Folder in which bakes that take long are kept, and found the next time; None keeps none.
 
     Raises OptionError for a device that is not there, an estimator that has nothing to bake, or both ``camera`` and
     ``camera_path``; SceneError for a scene that was edited after it was built.
@@ -153,11 +160,15 @@ def bake(
         raise OptionError("camera and camera_path are two names of one argument; give camera")
     camera = camera_path if camera is None else camera
     told = (lambda share: progress("bake", share)) if progress else None
+
+    def make() -> Bake | None:
+        return estimator.bake(scene, device, seed, told, camera)
+
     with scene.lock:
         scene.check_unchanged()
         scene.update_sky(sky_start(scene.sky_at))
         scene.update(0.0, None, device)
-        result = estimator.bake(scene, device, seed, told, camera)
+        result = cached_bake(cache, estimator, scene, camera, launch.get_device(device), seed, make)
     if result is None and isinstance(estimator, Estimator) and estimator.radiance_cache is not None:
         raise OptionError(
             f"{type(estimator).__name__} has nothing to bake, but the cache has that its paths end in: bake its ends_in"

@@ -19,6 +19,7 @@ from warp_gi.denoise import Denoiser
 from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.frame import Frame
+from warp_gi.kept import BakeFolder, cached_bake
 from warp_gi.kernels import compose, types
 from warp_gi.pipeline import DENOISER, Pipeline
 from warp_gi.primary import CameraRays
@@ -58,6 +59,7 @@ class FrameScheduler:
         seed: Every random number follows from it, the frame, the pixel and the sample.
         progress: Called with (stage, share done in [0, 1]) while baking and tracing.
         bakes: Bakes made before (``gi.bake``, ``gi.load_bake``), each for the estimators that it names.
+        cache: Folder in which bakes that take long are kept, and found the next time; None keeps none.
 
     Several may render one scene, in turns or on threads of their own: a frame has the scene to itself until it is
     done. Each is for one thread at a time.
@@ -74,6 +76,7 @@ class FrameScheduler:
         seed: int = 0,
         progress: Callable[[str, float], None] | None = None,
         bakes: Iterable[Bake] = (),
+        cache: BakeFolder | str | Path | None = None,
     ) -> None:
         bakes = list(bakes)
         if isinstance(scene, Bake):
@@ -97,6 +100,7 @@ class FrameScheduler:
         self._parts = self.pipeline.parts()
         self._bakes = _bakes_by_class(bakes, self._parts)
         self._bake_digests: dict[str, str] = {}
+        self._cache = cache
         self._made: dict[tuple[str, str, str], Bake] = {}
         self._states: dict[str, Any] = {}
         self._keys: dict[str, str] = {}
@@ -143,7 +147,9 @@ class FrameScheduler:
             self._progress(f"bake {place}", 0.0)
             told = lambda share: self._progress(f"bake {place}", share)  # noqa: E731
             identity = self._bake_id(part)
-            bake = self._made.get(identity) or part.bake(whole_scene(self.scene), device, self.seed, told, self.camera)
+            make = lambda: part.bake(whole_scene(self.scene), device, self.seed, told, self.camera)  # noqa: E731
+            where = self._cache, part, self.scene, self.camera, self.device, self.seed
+            bake = self._made.get(identity) or cached_bake(*where, make)
             if bake is not None and sum(type(one) is type(part) for one in self._parts.values()) > 1:
                 self._made[identity] = bake  # for the other places of its class
         elif bake is not None and not isinstance(self.scene, BakedScene):

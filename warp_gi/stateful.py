@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from warp_gi.scene.camera import views_hash
+
 if TYPE_CHECKING:
     import warp as wp
 
@@ -91,6 +93,14 @@ class Stateful:
     def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Setting]:
         """Return the settings that a bake depends on."""
         return {}
+
+    def bake_identity(self, scene: Scene | BakedScene, camera: Camera | CameraPath | None = None) -> str:
+        """Return what decides a bake's bits beside class, settings, seed and device: a folder keeps bakes by it.
+
+        By default the whole scene, under its sky of now, and all views of ``camera``. An override leaves out what the
+        bake never reads.
+        """
+        return f"{scene.hash} {views_hash(camera)}"
 
     def bake(
         self,

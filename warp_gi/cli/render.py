@@ -29,6 +29,7 @@ from warp_gi.errors import OptionError
 from warp_gi.files import check_writable
 from warp_gi.foretold import kernels_of
 from warp_gi.frame import Frame
+from warp_gi.kept import BakeFolder
 from warp_gi.pipeline import Pipeline
 from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.camera import Camera, CameraPath
@@ -36,7 +37,6 @@ from warp_gi.scene.scene import Scene
 from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence.frames import parse_frames
 from warp_gi.sequence.resume import Output, Plan, SequenceRun, Shot, shots_of
-from warp_gi.techniques.reuse.pictures import check_pictures, reuse_pictures
 
 DESCRIPTION = """Render a sequence of frames to EXR files with named layers, and PNG previews.
 
@@ -91,6 +91,9 @@ class Render(SceneOptions):
     """Write a tone-mapped PNG beside each frame."""
     exposure: float = 0.0
     """Exposure of previews in stops."""
+    cache: bool = True
+    """Keep bakes that take long, and use them the next time: in the folder WARP_GI_BAKES, or warp_gi/bakes in
+    XDG_CACHE_HOME or ~/.cache, at most 2 GiB. Frames are the same."""
     reuse_pictures: Annotated[Path | None, flag("FOLDER", "none")] = None
     """Folder for pictures of what the last frame's samples taught: the octree's leaves, samples and lights in them,
     shares of exploration and of the BSDF. The pipeline has to learn, as reuse and hybrid do."""
@@ -141,8 +144,13 @@ def run(options: Render, report: Reporter) -> None:
     if isinstance(scene, Scene):
         move_sky(scene, options.environment_turn, camera, [shot.index for shot in shots])
     source = scene.bake if isinstance(scene, BakedScene) else scene
-    scheduler = FrameScheduler(source, camera, options.settings, options.device, options.seed, report.stage, bakes)
+    cache = BakeFolder() if options.cache else None
+    scheduler = FrameScheduler(
+        source, camera, options.settings, options.device, options.seed, report.stage, bakes, cache
+    )
     if options.reuse_pictures is not None:
+        from warp_gi.techniques.reuse.pictures import check_pictures  # its kernels are not for every run
+
         check_pictures(scheduler, shots[-1].camera, options.reuse_pixel)
     sequence = SequenceRun(scheduler, shots, find_output(options))
     with report.phase("bake"):
@@ -205,6 +213,8 @@ def render_shots(options: Render, plan: Plan, sequence: SequenceRun, report: Rep
             for stage, seconds in frame.timings.items():
                 times.setdefault(stage, []).append(seconds)
             if options.reuse_pictures is not None and shot is plan.todo[-1]:
+                from warp_gi.techniques.reuse.pictures import reuse_pictures
+
                 reuse_pictures(sequence.scheduler, frame, options.reuse_pictures, options.reuse_pixel)
                 report.line(f"pictures: {options.reuse_pictures}")
             del frame  # before there is a next one

@@ -170,6 +170,10 @@ class RadianceTransfer(Estimator, RadianceCache):
         """Return the settings that the bake depends on."""
         return self.transfer_settings.stored()
 
+    def bake_identity(self, scene: Scene | BakedScene, camera: Camera | CameraPath | None = None) -> str:
+        """Return the hash of what is baked: never the sky, and no view."""
+        return self.bake_key(scene)
+
     def bake(
         self,
         scene: Scene,

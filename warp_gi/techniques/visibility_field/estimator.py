@@ -19,7 +19,7 @@ from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_bake as bake_kernels
 from warp_gi.kernels import visibility_field_trace as trace_kernels
 from warp_gi.scene.baked import BakedScene, whole_scene
-from warp_gi.scene.camera import Camera, CameraPath
+from warp_gi.scene.camera import Camera, CameraPath, views_hash
 from warp_gi.techniques.visibility_field.bake import field_query, grid_of
 from warp_gi.techniques.visibility_field.settings import MaskSettings
 from warp_gi.techniques.visibility_field.state import (
@@ -140,6 +140,10 @@ class VisibilityField(Estimator):
         """Return the settings that decide the masks, with the cell size in metres."""
         settings = self.mask_settings
         return stored_settings(settings, grid_of(scene.bounds, settings.cell_size))
+
+    def bake_identity(self, scene: Scene | BakedScene, camera: Camera | CameraPath | None = None) -> str:
+        """Return the hash of the geometry, and of the views if only cells that they see are baked."""
+        return f"{self.bake_key(scene)} {views_hash(camera) if self.lazy else 'everywhere'}"
 
     def bake(
         self,
