@@ -30,6 +30,16 @@ class Ahead:
     """Whether the scene gets another sky from frame to frame."""
 
 
+@dataclass(frozen=True)
+class Forecast:
+    """What a bake will cost, told before it starts."""
+
+    bake_seconds: float
+    """CPU seconds of the bake, about."""
+    most_saved: float = 0.0
+    """CPU seconds that it can save in a frame at most; 0 where nothing is known of that."""
+
+
 _EARLIER = {
     "learn": "learn in after(frame, state), from frame.offered(Lesson) of the service SampleOctree",
     "makes_primary": "return a Primary as own_primary",
@@ -101,6 +111,15 @@ class Stateful:
         bake never reads.
         """
         return f"{scene.hash} {views_hash(camera)}"
+
+    def forecast(
+        self, scene: Scene, device: wp.Device, seed: int, camera: Camera | CameraPath, samples: int
+    ) -> Forecast | None:
+        """Return what ``bake`` will cost for frames of ``samples`` samples a pixel, from a small share of it; or None.
+
+        None is for a bake that takes seconds at most, or that says itself what it costs.
+        """
+        return None
 
     def bake(
         self,
