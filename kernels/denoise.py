@@ -13,7 +13,7 @@ import warp as wp
 
 from warp_gi.kernels.bsdf import luminance
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 4})  # compiles in less than two thirds, and is as fast
 
 LEAST_SPECULAR = wp.constant(wp.float32(1.0e-3))  # glossy light is divided by no less
 LEAST_REFLECTANCE = wp.constant(wp.float32(1.0e-6))  # where a surface is darker, no light to filter leaves it

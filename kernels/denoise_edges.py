@@ -27,7 +27,7 @@ from warp_gi.kernels.sampling import CAMERA_DIMENSION, circle, filter_offset, ha
 from warp_gi.kernels.surface import Surface, shading_normal, surface_at, surface_emission
 from warp_gi.kernels.types import SceneData
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 4})  # compiles in less than two thirds, and is as fast
 
 LEAST_COSINE = wp.constant(wp.float32(0.9))  # between normals of pixels that do not differ
 LEAST_CONTRAST = wp.constant(wp.float32(0.05))  # squared, between colours that differ

@@ -184,15 +184,15 @@ def environment_sample(env: Environment, u: wp.vec3) -> EnvironmentSample:
 
 # What comes from the direction of a sample, and the density of such samples: as environment_lookup says of it.
 @wp.func
-def environment_arrival(env: Environment, e: EnvironmentSample) -> EnvironmentLookup:
+def environment_arrival(env: Environment, drawn: EnvironmentSample) -> EnvironmentLookup:
     r = EnvironmentLookup()
     if env.kind == ENVIRONMENT_MAP:
-        patch = patch_nodes(env, e.row, e.column)
-        patch.s = e.s
-        patch.t = e.t
+        patch = patch_nodes(env, drawn.row, drawn.column)
+        patch.s = drawn.s
+        patch.t = drawn.t
         texel = patch_texel(patch)
         r.radiance = wp.cw_mul(texel, env.radiance)
-        r.pdf = patch_pdf(env, e.row, texel, polar_angle(e.row, e.t, env.height)[1])
+        r.pdf = patch_pdf(env, drawn.row, texel, polar_angle(drawn.row, drawn.t, env.height)[1])
     elif env.kind == ENVIRONMENT_CONSTANT:
         r.radiance = env.radiance
         r.pdf = UNIFORM_SPHERE_PDF

@@ -206,8 +206,8 @@ def occluded_lanes(scene: SceneData, p: FieldPixel, octet: vec33, bits: wp.int32
 @wp.func
 def weighted_sky(scene: SceneData, sky: FieldSky, direction: wp.vec3, pdf: wp.float32) -> wp.vec3:
     if sky.kind == SKY_MAP:
-        e = environment_lookup(scene.environment, direction)
-        return e.radiance * (pdf / (pdf + e.pdf))
+        beyond = environment_lookup(scene.environment, direction)
+        return beyond.radiance * (pdf / (pdf + beyond.pdf))
     if sky.kind == SKY_HARMONIC:
         return sky.harmonics * harmonics(direction)
     return sky.radiance
@@ -456,9 +456,9 @@ def sample_sky(first: wp.int32, scene: SceneData, seed: wp.uint32, sky: FieldSky
     k = first + wp.tid()
     u = sample_2d(wp.uint32(k), seed, SET_SKY_DIMENSION)
     digits = random_1d(wp.uint32(k), seed, SET_SKY_DIGITS_DIMENSION)
-    e = environment_sample(scene.environment, wp.vec3(u[0], u[1], digits))
-    source = environment_arrival(scene.environment, e)
-    sky.directions[k] = e.direction
+    drawn = environment_sample(scene.environment, wp.vec3(u[0], u[1], digits))
+    source = environment_arrival(scene.environment, drawn)
+    sky.directions[k] = drawn.direction
     sky.pdfs[k] = source.pdf
     sky.radiances[k] = source.radiance
 

@@ -19,6 +19,7 @@ _PUBLIC = {
     "UnsupportedWarning": "warp_gi.errors",
     "Bake": "warp_gi.baking",
     "load_bake": "warp_gi.baking",
+    "BakeFolder": "warp_gi.kept",
     "TriangleBvh": "warp_gi.bvh",
     "Hits": "warp_gi.bvh",
     "Scene": "warp_gi.scene.scene",

@@ -244,6 +244,11 @@ class SpatioTemporal(Denoiser):
         """True: a file holds what the next frame reads, some 70 bytes a pixel."""
         return True
 
+    def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
+        """Return the kernels of the filter, and of edges."""
+        edges = (denoise_edges.sample_edges,) if self.edge_samples or self.blend < 1 else ()
+        return (denoise.separate_light, *edges)
+
     def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> History:
         """Return a history of no frame."""
         return History.empty(scene, wp.get_device(device))

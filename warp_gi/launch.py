@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 import numpy as np
 import warp as wp
 
-from warp_gi import forks, workers
+from warp_gi import forks, loading, workers
 from warp_gi.errors import OptionError
 
 Struct = TypeVar("Struct")
@@ -33,13 +33,13 @@ SLICES_PER_THREAD = 16  # enough to balance uneven work, few enough that 30 us a
 SMALLEST_SLICE = 256  # items
 CUDA_BLOCK = 256  # threads
 
-_loading = threading.RLock()  # taken across a fork, so that no thread that only the parent has is inside the compiler
+_loading = threading.RLock()  # taken across a fork, so that no thread that only the parent has is inside the linker
 _threads: int | None = None
 compile_seconds = 0.0
-"""Wall seconds that this process has spent compiling or loading kernel modules."""
+"""Wall seconds that launches of this process have waited for kernel modules to compile or load."""
 compile_cpu_seconds = 0.0
-"""CPU seconds that this process has spent compiling or loading kernel modules; fewer than wall seconds where other
-processes wanted the cores."""
+"""CPU seconds that all threads of this process have spent compiling or loading kernel modules."""
+_counting = threading.RLock()
 on_load: Callable[[str], None] | None = None
 """Called with a kernel module's name before its first launch, which may take seconds to compile; for progress."""
 _loaded: set[tuple[str, str]] = set()
@@ -126,17 +126,42 @@ def copied(source: Struct, struct: type[Struct]) -> Struct:
 
 
 def load(kernel: wp.Kernel, device: wp.Device) -> None:
-    """Compile or load the kernel's module now; add its time to ``compile_seconds`` and ``compile_cpu_seconds``."""
-    global compile_seconds, compile_cpu_seconds
-    started, cpu = time.perf_counter(), time.process_time()
+    """Compile or load the kernel's module now, or wait for the thread that does.
+
+    The time is added to ``compile_seconds``, and what this thread spent of it to ``compile_cpu_seconds``.
+    """
+    global compile_seconds
+    started = time.perf_counter()
     module = (kernel.module.name, device.alias)
-    with _loading:
-        if module not in _loaded and on_load is not None:
-            on_load(kernel.module.name)
+    if module not in _loaded and on_load is not None:
+        on_load(kernel.module.name)
+    if device.is_cpu:
+        loading.wait_for(kernel.module.name)
+    _load_here(kernel, device)
+    _loaded.add(module)
+    with _counting:
+        compile_seconds += time.perf_counter() - started
+
+
+def load_ahead(kernels: Iterable[wp.Kernel], device: wp.Device) -> None:
+    """Begin to compile or load the kernels' modules on other threads, where the CPU may use several, and return.
+
+    A launch waits for its own module alone. Kernels that an earlier call named, and this one does not, are left out if
+    no thread has begun with them. On CUDA, and with one thread, modules are loaded as they are launched.
+    """
+    if device.is_cpu and thread_count() > 1:
+        wanted = [one for one in kernels if (one.module.name, device.alias) not in _loaded]
+        loading.load_ahead(wanted, lambda kernel: _load_here(kernel, device), thread_count())
+
+
+def _load_here(kernel: wp.Kernel, device: wp.Device) -> None:
+    global compile_cpu_seconds
+    cpu = time.thread_time()
+    with loading.lock_of(kernel.module.name):
+        loading.prepare(kernel.module)
         kernel.module.load(device, 1 if device.is_cpu else CUDA_BLOCK)
-        _loaded.add(module)
-    compile_seconds += time.perf_counter() - started
-    compile_cpu_seconds += time.process_time() - cpu
+    with _counting:
+        compile_cpu_seconds += time.thread_time() - cpu
 
 
 def launch(
@@ -154,7 +179,7 @@ def launch(
         return
     load(kernel, device)
     if device.alias not in _bound.get(kernel, ()):
-        with _loading:  # the linker has locks, as the compiler
+        with _loading:  # the linker has locks that a fork has to find free
             wp.launch(kernel, dim=1, inputs=[0, *inputs], device=device, record_tape=False, record_cmd=True)
         _bound.setdefault(kernel, set()).add(device.alias)
     if device.is_cuda:
@@ -216,8 +241,8 @@ def _mismatch(expected: Any, value: object, device: wp.Device) -> str | None:
 
 
 def _unlock_loading() -> None:
-    global _loading
-    _loading = threading.RLock()
+    global _loading, _counting
+    _loading, _counting = threading.RLock(), threading.RLock()
 
 
 if hasattr(os, "register_at_fork"):

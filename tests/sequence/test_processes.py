@@ -111,6 +111,17 @@ def fork_while_a_thread_compiles():
         thread.join()
 
 
+def fork_while_modules_load_ahead():
+    """The fork waits for what has begun; the child loads by itself what it launches."""
+    launch.set_threads(2)
+    with tempfile.TemporaryDirectory() as folder:
+        wp.config.kernel_cache_dir = folder
+        kernels = {factor: make_kernel(factor) for factor in (2, 3, 4)}
+        launch.load_ahead(kernels.values(), launch.get_device("cpu"))
+        assert in_fork(lambda: all(launches_right(kernels[factor], factor) for factor in (4, 3, 2)))
+        assert all(launches_right(kernels[factor], factor) for factor in (2, 3, 4))
+
+
 def fork_while_a_thread_renders():
     """The child gets a scene that is half moved, and locks that a thread holds which it does not have."""
     scene = moving_room()
@@ -203,6 +214,7 @@ FORKING = (
     render_first_in_the_child,
     compile_in_the_child,
     fork_while_a_thread_compiles,
+    fork_while_modules_load_ahead,
     fork_while_a_thread_renders,
     fork_in_a_launch,
     write_exr_in_the_child,

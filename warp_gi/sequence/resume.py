@@ -182,7 +182,7 @@ class SequenceRun:
     def bake(self) -> None:
         """Bake under the sky of the sequence's first frame, so that a resumed sequence has the same bake."""
         with self.scheduler.scene.lock:
-            self.scheduler.bake(self.shots[0].time)
+            self.scheduler.bake(self.shots[0].time, len(self.shots))
 
     @cached_property
     def dependence(self) -> Dependence:

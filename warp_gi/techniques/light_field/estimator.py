@@ -27,6 +27,8 @@ from warp_gi.techniques.shared.lamps import lit_data
 from warp_gi.techniques.shared.views import camera_rows, cameras_of
 
 if TYPE_CHECKING:
+    import warp as wp
+
     from warp_gi.frame import Frame
     from warp_gi.scene.scene import Scene
 
@@ -225,6 +227,14 @@ class LightFieldProbes(Estimator, RadianceCache):
     def own_primary(self) -> Primary | None:
         """Camera rays through the probes, if ``primary`` is "probes"; else None."""
         return ProbeRays() if self.primary == "probes" else None
+
+    def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
+        """Return the kernels of light at surfaces."""
+        return (trace_kernels.trace_probes,)
+
+    def samplers(self, scene: Scene | BakedScene | None = None) -> tuple[Any, ...]:
+        """Return the probes, as paths end in them."""
+        return (light_field_cache.PROBE_CACHE,)
 
     def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
         """Return whether frames may show probes that follow a sky or objects, and so what earlier frames refreshed."""
