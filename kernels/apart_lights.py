@@ -104,13 +104,13 @@ def sun_sample(data: ApartData, scene: SceneData, sun: Sun, u: wp.vec2) -> Light
     if at > sun.start:
         below = data.sums[at - 1]
     across = wp.clamp((u[0] - below) / (data.sums[at] - below), 0.0, LARGEST_FLOAT_BELOW_ONE)
-    e = node_sample(data.rest, data.nodes[at], across, u[1])
-    all = patch_nodes(scene.environment, e.row, e.column)
-    all.s = e.s
-    all.t = e.t
-    found = sun_light(data, scene.environment, all, polar_angle(e.row, e.t, data.rest.height)[1], sun.density)
+    rest = node_sample(data.rest, data.nodes[at], across, u[1])
+    all = patch_nodes(scene.environment, rest.row, rest.column)
+    all.s = rest.s
+    all.t = rest.t
+    found = sun_light(data, scene.environment, all, polar_angle(rest.row, rest.t, data.rest.height)[1], sun.density)
     r = LightSample()
-    r.direction = e.direction
+    r.direction = rest.direction
     r.distance = INFINITELY_FAR
     r.pdf = found.pdf
     if found.pdf > 0.0:
