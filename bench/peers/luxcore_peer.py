@@ -24,7 +24,7 @@ from warp_gi.color import decode_srgb
 
 PYTHON = os.environ.get("WARP_GI_LUXCORE_PYTHON", sys.executable)
 HOW_TO_INSTALL = (
-    "no module pyluxcore; install it with: pip install pyluxcore; "
+    "no module pyluxcore; install it with: pip install '.[luxcore]' (or pyluxcore alone); "
     "WARP_GI_LUXCORE_PYTHON names another Python that has it"
 )
 

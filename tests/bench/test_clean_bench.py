@@ -213,9 +213,8 @@ def rows(kept, pictures):
             patch.setattr(module, "QUICK_SPP", 16)
         patch.setattr(sequences, "QUICK_LAST", 5)
         patch.setattr(sequences, "QUICK_SAMPLES", (1, 16))
-        patch.setattr(switched, "QUICK_LATER", switched.LATER)
         patch.setattr(first, "QUICK_COMMAND", (*first.QUICK_COMMAND[:-1], "24x16"))
-        return suite.run(True, "cpu", ("built-in", "moving", "switched", "first"), pictures)
+        return suite.run(True, "cpu", ("built-in", "switched", "first"), pictures)
 
 
 def named(rows, table, **values):
@@ -247,9 +246,9 @@ def test_references_are_told(rows):
 
 def test_a_light_that_goes_out_is_forgotten(rows):
     found = named(rows, switched.TABLE, renderer=contenders.CLEAN)
-    assert [row["frames later"] for row in found] == list(switched.LATER)
+    assert [row["frames later"] for row in found] == [0, switched.SOON]
     assert found[0]["old light left"] > found[-1]["old light left"]
-    assert [row["most left"] for row in found] == ["", "", "", switched.MOST_SOON, switched.MOST_LONG]
+    assert [row["most left"] for row in found] == ["", switched.MOST_SOON]
 
 
 def test_the_first_command_is_timed(rows):
@@ -262,8 +261,9 @@ def test_a_command_that_fails_is_a_row():
 
 
 def test_pictures_stand_beside_the_reference(rows, pictures):
-    names = [pictures.sets[0].case, pictures.sets[1].case]
-    assert names == ["Cornell box", "crate slides"] and "clean, 1 spp" in pictures.sets[0].images
+    names = [one.case for one in pictures.sets]
+    assert names == ["Cornell box", *(f"light switched off, {later} frames later" for later in (0, 3))]
+    assert "clean, 1 spp" in pictures.sets[0].images and "clean" in pictures.sets[1].images
 
 
 # ---- other renderers ----
@@ -306,7 +306,7 @@ def test_renderers_that_are_not_installed_are_rows(monkeypatch):
     monkeypatch.setattr(luxcore_peer, "PYTHON", "/nowhere/python")
     monkeypatch.setattr(blender_peer, "PYTHON", "/nowhere/python")
     shown = box(), gi.builtin_camera_path("cornell_box"), (0,), 1, "cpu"
-    for name, words in ((renderers.LUXCORE, "pip install pyluxcore"), (renderers.GUIDED, "no module bpy")):
+    for name, words in ((renderers.LUXCORE, "pyluxcore alone"), (renderers.GUIDED, "no module bpy")):
         with pytest.raises(PeerMissing, match=words):
             renderers.RENDERERS[name](*shown)
 
@@ -346,12 +346,12 @@ def test_documents_show_all_of_it(rows, peer_rows):
     stamped[0]["pattern"] = 0.4  # no wall is large enough here
     text = region_text("clean", REGIONS["clean"], stamped)
     assert "smooth: **0.40**." in " ".join(text.split())
-    assert "| Cornell box |" in text and "| crate slides |" in text and "| switched off |" in text
+    assert "| Cornell box |" in text and "| switched off |" in text
     assert "| Cornell box |" in region_text("clean short", REGIONS["clean short"], stamped)
     assert "4 frames of the atrium" in region_text("clean first", REGIONS["clean first"], stamped)
     assert "| flat, 8 spp |" in region_text("clean peers", REGIONS["clean peers"], stamped)
     shown = {plot.title: plot for plot in suite_plots.plots_of("clean", rows)}
-    assert len(shown["FLIP over CPU time, crate slides"].series["clean"][0]) == 2
+    assert len(shown["FLIP over CPU time, Cornell box"].series["clean"][0]) == 2
     assert "switched off, clean" in shown["Old light left after a switch"].series
 
 
