@@ -314,3 +314,15 @@ def test_variance_of_an_edge_counts_the_sky_beside_it():
     mean = frame.numpy("beauty").astype(np.float64)
     assert ((mean > 0.1) & (mean < 0.9)).any()
     assert np.allclose(frame.numpy("variance"), mean * (1.0 - mean) / 15.0, atol=1e-6)
+
+
+def test_qualities_of_a_preset():
+    """Presets that say nothing of them take a quarter of their samples, or four times as many."""
+    clean = {quality: gi.Pipeline.preset("clean", quality=quality) for quality in ("draft", "normal", "high")}
+    assert clean["normal"] == gi.Pipeline.preset("clean")
+    samples = [(one.spp, one.denoise.edge_samples, one.denoise.first_samples) for one in clean.values()]
+    assert samples == sorted(samples) and len(set(samples)) == 3
+    assert [gi.Pipeline.preset("path", quality=quality).spp for quality in clean] == [4, 16, 64]
+    assert gi.Pipeline.preset("path", quality="high", spp=2).spp == 2
+    with pytest.raises(OptionError, match=r"unknown quality 'best' \(known: draft, high, normal\)"):
+        gi.Pipeline.preset("clean", quality="best")

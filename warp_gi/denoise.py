@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import importlib
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import warp as wp
 
+from warp_gi import launch
 from warp_gi.errors import OptionError, check_whole, one_line, unknown_name
 from warp_gi.kernels import denoise, denoise_edges
 from warp_gi.stateful import Ahead, Stateful
@@ -72,8 +74,40 @@ class History:
     """Geometry and colours of the surfaces in the frame's pixels."""
     average: denoise.Signals
     """Averages over frames of diffuse and glossy light, and the number of frames in them."""
-    picture: wp.array | None
+    picture: wp.array | None = None
     """The frame's beauty, vec3 [height * width], if pictures are averaged."""
+
+    @staticmethod
+    def empty(scene: Scene | BakedScene, device: wp.Device) -> History:
+        """Return the state before the first frame, which leads to none."""
+        return History(-1, (0, 0), (scene, ""), _empty(denoise.Guides, device), _empty(denoise.Signals, device))
+
+    def saved_arrays(self) -> dict[str, np.ndarray]:
+        """Return what the next frame reads, as arrays."""
+        parts = {f"{name}": getattr(self.guides, name) for name in READ_GUIDES}
+        parts |= {name: getattr(self.average, name) for name in launch.fields_of(denoise.Signals)}
+        parts |= {} if self.picture is None else {"picture": self.picture}
+        frame = {
+            "frame": np.array([self.index, *self.resolution]),
+            "light": np.frombuffer(self.scene[1].encode(), np.uint8),
+        }
+        return frame | {name: array.numpy() for name, array in parts.items()}
+
+    def with_saved_arrays(self, arrays: Mapping[str, np.ndarray]) -> History:
+        """Return the state that ``saved_arrays`` is of; raises KeyError or ValueError where it cannot be one."""
+        device = self.average.length.device
+        index, *size = (int(number) for number in arrays["frame"].reshape(3))
+        guides, average = _empty(denoise.Guides, device), _empty(denoise.Signals, device)
+        for struct, name in [
+            *((guides, n) for n in READ_GUIDES),
+            *((average, n) for n in launch.fields_of(denoise.Signals)),
+        ]:
+            setattr(struct, name, _loaded(arrays[name], getattr(struct, name), size[0] * size[1]))
+        picture = None
+        if "picture" in arrays:
+            picture = _loaded(arrays["picture"], average.diffuse, size[0] * size[1])
+        light = arrays["light"].tobytes().decode("ascii")
+        return History(index, (size[0], size[1]), (self.scene[0], light), guides, average, picture)
 
     def leads_to(self, frame: Frame) -> bool:
         """Return whether the frame's motion is towards the last frame, of the same scene and size."""
@@ -83,6 +117,25 @@ class History:
             and frame.scene is self.scene[0]
             and light_of(frame.scene) == self.scene[1]
         )
+
+
+READ_GUIDES = ("guide_object", "guide_normal", "guide_position")
+"""Guides that the next frame reads (``denoise.same_surface``)."""
+
+
+def _empty(struct: type[launch.Struct], device: wp.Device) -> launch.Struct:
+    """Return a kernel struct whose arrays have no items."""
+    empty = struct()
+    for name, field in struct.vars.items():  # type: ignore[attr-defined]
+        setattr(empty, name, wp.empty(0, dtype=field.type.dtype, device=device))
+    return empty
+
+
+def _loaded(array: np.ndarray, like: wp.array, count: int) -> wp.array:
+    """Return an array on the device of another one, with its type; raises ValueError unless it has ``count`` items."""
+    if len(array) != count:
+        raise ValueError(f"{len(array)} pixels instead of {count}")
+    return wp.array(array, dtype=like.dtype, device=like.device)
 
 
 def light_of(scene: Scene | BakedScene) -> str:
@@ -151,18 +204,27 @@ class SpatioTemporal(Denoiser):
         if not 0 <= self.lag < math.inf:
             raise OptionError(f"lag must be 0 or a number of deviations above it, got {self.lag}")
 
-    def samples(self, frame: Frame, state: History | None) -> int:
+    @property
+    def saves_state(self) -> bool:
+        """True: a file holds what the next frame reads, some 70 bytes a pixel."""
+        return True
+
+    def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> History:
+        """Return a history of no frame."""
+        return History.empty(scene, wp.get_device(device))
+
+    def samples(self, frame: Frame, state: History) -> int:
         """Return ``first_samples`` at least for a frame that no frame leads to."""
-        has_history = state is not None and state.leads_to(frame)
+        has_history = state.leads_to(frame)
         return frame.settings.spp if has_history else max(frame.settings.spp, self.first_samples)
 
-    def apply(self, frame: Frame, state: History | None) -> History:
+    def apply(self, frame: Frame, state: History) -> History:
         """Fill ``frame["beauty"]``; the state is the last frame's History."""
         light, guides = frame.struct(denoise.NoisyLight), frame.struct(denoise.Guides)
         settings, average = self._settings(frame), self._signals(frame)
         frame.launch(denoise.separate_light, [settings, light, guides, average])
-        has_history = state is not None and state.leads_to(frame)
-        if state is not None and has_history:
+        has_history = state.leads_to(frame)
+        if has_history:
             average = self._accumulated(frame, settings, state, guides, average)
         filtered = self._filtered(frame, settings, guides, average, 0 if has_history else 1)
         frame.launch(denoise.put_back, [light, guides, filtered, frame["beauty"]])
@@ -170,7 +232,7 @@ class SpatioTemporal(Denoiser):
         if edges.samples > 0:
             inputs = [frame.data, frame.camera_data, settings, edges, guides, filtered, frame["beauty"]]
             frame.launch_tiled(denoise_edges.sample_edges, inputs)
-        if state is not None and has_history and state.picture is not None:
+        if has_history and state.picture is not None:
             picture = wp.clone(frame["beauty"])
             inputs = [settings, edges, frame["depth"], frame["motion"], picture, state.picture, frame["beauty"]]
             frame.launch(denoise_edges.average_pictures, inputs)

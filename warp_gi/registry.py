@@ -61,6 +61,8 @@ class Technique:
 
     A value is the name of a class, a pair of that and its settings, or what it is: ``pipeline.made``.
     """
+    qualities: Mapping[str, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
+    """Fields by preset and quality, "draft" and "high", where they differ from the preset's own."""
     samplers: tuple[str, ...] = ()
     """Light samplers, direction samplers, skies and caches of path tracers: "module.NAME" below warp_gi.kernels."""
     bake_tool: str = ""
@@ -107,6 +109,11 @@ def bake_tool(name: str) -> Any:
 def presets() -> dict[str, Mapping[str, Any]]:
     """Return the fields of every named pipeline, where they differ from the default's."""
     return {name: preset for one in techniques().values() for name, preset in one.presets.items()}
+
+
+def qualities(preset: str) -> Mapping[str, Mapping[str, Any]]:
+    """Return the fields of a preset by quality, where they differ from its own."""
+    return next((one.qualities[preset] for one in techniques().values() if preset in one.qualities), {})
 
 
 def public() -> dict[str, str]:

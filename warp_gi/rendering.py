@@ -6,17 +6,18 @@ from collections.abc import Callable, Container, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from warp_gi.baking import Bake
 from warp_gi.errors import OptionError
 from warp_gi.estimator import Estimator
-from warp_gi.pipeline import Pipeline
+from warp_gi.pipeline import DEFAULT, Pipeline
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.sky_motion import sky_start
 from warp_gi.scheduler import FrameScheduler
+from warp_gi.sequence.frame_time import check_seconds, samples_within, take_time
 from warp_gi.sequence.resume import Output, Plan, SequenceRun, shots_of
 from warp_gi.stateful import Stateful
 
 if TYPE_CHECKING:
-    from warp_gi.baking import Bake
     from warp_gi.frame import Frame
     from warp_gi.scene.scene import Scene
 
@@ -39,6 +40,7 @@ def render(
     precision: Literal["half", "float"] = "half",
     preview: bool = False,
     exposure: float = 0.0,
+    frame_time: float | None = None,
 ) -> Iterator[Frame]:
     """Yield the frames of a sequence, and write them to files if there is an ``output``.
 
@@ -52,7 +54,8 @@ def render(
     Args:
         scene: What is rendered; or a Bake that can be rendered without its scene, by the preset "probe_view".
         camera: A Camera (one frame) or a CameraPath.
-        pipeline: The estimators; None is the preset "path".
+        pipeline: The estimators; None is the preset "clean", and "probe_view" for a Bake. ``Pipeline()`` is the
+            reference, "path".
         frames: Frame numbers in order; None is every frame of the path.
         device: "cpu", "cuda", "cuda:1".
         seed: Every random number follows from it, the frame, the pixel and the sample.
@@ -66,6 +69,9 @@ def render(
         precision: Storage of colours and normals in EXR files: "half" or "float".
         preview: Write a tone-mapped PNG beside each EXR file.
         exposure: Exposure of PNG files in stops.
+        frame_time: Wall seconds that a frame may take here; the number of samples a pixel then follows from frames
+            that are timed first. It is one for all frames, and in their metadata: a resumed sequence repeats it. The
+            first frame may take more (``SpatioTemporal.first_samples``). None takes those of the pipeline.
 
     Raises OptionError for a device that is not there, a negative frame or seed, files that frames cannot be, several
     frames for one file; BakeError for a bake of another scene or other settings; SceneError for a scene that was
@@ -73,9 +79,16 @@ def render(
     """
     if output is None and (resume or preview or exposure or precision != "half"):
         raise OptionError('resume, precision, preview and exposure are of files; give output="out/shot.####.exr" too')
+    if frame_time is not None:
+        check_seconds(frame_time)
     wanted = _frame_numbers(camera, frames)
-    scheduler = FrameScheduler(scene, camera, pipeline or Pipeline(), device, seed, progress, bakes)
+    scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, progress, bakes)
     if output is None:
+        if frame_time is not None and wanted:
+            scheduler.take_samples(
+                samples_within(scheduler, shots_of(camera, list(dict.fromkeys(wanted)), "#.exr"), frame_time),
+                frame_time,
+            )
         for position, index in enumerate(wanted):
             if index not in skip:
                 yield scheduler.frame(index, wanted[position - 1] if position else None)
@@ -85,6 +98,8 @@ def render(
     if not shots:
         return
     run = SequenceRun(scheduler, shots, files)
+    if frame_time is not None:
+        take_time(run, frame_time, resume)
     plan = run.plan(resume)
     run.prepare(plan)
     for shot in plan.todo:
@@ -106,6 +121,7 @@ def plan_sequence(
     *,
     output: str | Path,
     precision: Literal["half", "float"] = "half",
+    frame_time: float | None = None,
 ) -> Plan:
     """Return what ``render`` with these arguments and ``resume=True`` would render, and why; nothing is written.
 
@@ -115,10 +131,15 @@ def plan_sequence(
     the scene is left under the sky of the last frame.
     """
     wanted = _frame_numbers(camera, frames)
-    scheduler = FrameScheduler(scene, camera, pipeline or Pipeline(), device, seed, progress, bakes)
+    scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, progress, bakes)
     files = Output(Path(output), precision)
     shots = shots_of(camera, wanted, files.pattern)
-    return SequenceRun(scheduler, shots, files).plan() if shots else Plan((), ())
+    if not shots:
+        return Plan((), ())
+    run = SequenceRun(scheduler, shots, files)
+    if frame_time is not None:
+        take_time(run, frame_time, resume=True)
+    return run.plan()
 
 
 def bake(
@@ -164,6 +185,10 @@ def bake(
             f"{type(estimator).__name__} with these settings has nothing to bake; render with it as it is"
         )
     return result
+
+
+def _chosen(pipeline: Pipeline | None, scene: Scene | Bake) -> Pipeline:
+    return Pipeline.preset("probe_view" if isinstance(scene, Bake) else DEFAULT) if pipeline is None else pipeline
 
 
 def _frame_numbers(camera: Camera | CameraPath, frames: Iterable[int] | None) -> list[int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -106,6 +107,7 @@ class FrameScheduler:
         self._baked_version = -1
         self._sky_time = sky_start(self.scene.sky_at)
         self._scene_hash = ""
+        self._frame_time: float | None = None
 
     # ---- before the first frame ----
 
@@ -223,6 +225,29 @@ class FrameScheduler:
         frame.finish()
         return frame
 
+    def take_samples(self, spp: int, frame_time: float | None = None) -> None:
+        """Take ``spp`` samples a pixel from the next frame on, as they fit into ``frame_time`` seconds.
+
+        Raises OptionError for a number that the pipeline cannot take.
+        """
+        self.pipeline, self._frame_time = replace(self.pipeline, spp=spp), frame_time
+
+    def trial(self, index: int, previous_index: int, spp: int, resolution: tuple[int, int]) -> Frame:
+        """Render a frame after the one before it with other samples and pixels, and go on as if it had not been.
+
+        Of interest are its ``timings``. Raises OptionError for samples or a resolution out of range.
+        """
+        self.bake()
+        other = copy.copy(self)
+        other._states, other._keys = dict(self._states), dict(self._keys)
+        other._bake_digests, other._made = dict(self._bake_digests), dict(self._made)
+        other._progress = lambda stage, share: None
+        other.camera = self.camera.at_resolution(*resolution)
+        other.take_samples(spp)
+        if previous_index != index:
+            other.frame(previous_index)
+        return other.frame(index, previous_index)
+
     def _new_frame(self, index: int, previous_index: int) -> Frame:
         started, compiled = time.perf_counter(), launch.compile_seconds
         now = frame_time(self.camera, index)
@@ -275,6 +300,7 @@ class FrameScheduler:
             "device": self.device.name if self.device.is_cuda else "cpu",
             **self._bake_digests,
             **{f"pipeline.{key}": value for key, value in self.pipeline.describe().items()},
+            **({} if self._frame_time is None else {"frame_time": self._frame_time}),
         }
 
     # ---- between frames ----

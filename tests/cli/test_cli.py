@@ -21,7 +21,7 @@ from warp_gi.cli.report import LOG_WIDTH, Reporter, print_table
 from warp_gi.sequence import frames as sequence
 from warp_gi.sequence.preview import write_png
 
-SMALL = ["cornell_box", "--resolution", "24x16", "--spp", "4"]
+SMALL = ["cornell_box", "--resolution", "24x16", "--spp", "4", "--pipeline", "path"]
 COMMAND = [sys.executable, "-m", "warp_gi.cli"]
 
 
@@ -117,12 +117,13 @@ def _wait_for(folder, count):
         time.sleep(0.002)
 
 
+PATH, CLEAN = ["--pipeline=path"], ["--spp=16"]
 LEARNT = ["--pipeline=reuse", "--octree.split=1500", "--octree.collapse=700", "--spp=16", "--octree.most-samples=50000"]
 
 
-@pytest.mark.parametrize("extra", [[], LEARNT], ids=["path", "learnt"])
+@pytest.mark.parametrize("extra", [PATH, LEARNT, CLEAN], ids=["path", "learnt", "clean"])
 def test_killed_runs_resume_to_the_same_files(unbroken, tmp_path, extra):
-    """And where light is learnt from frame to frame, the state between them is kept as well."""
+    """And where frames depend on those before, as by default, the state between them is kept as well."""
     broken, whole = tmp_path / "broken", tmp_path / "whole"
     for count in (1, 3, 4):
         process = _start(broken, "--resume", "--preview", *extra)
@@ -135,7 +136,7 @@ def test_killed_runs_resume_to_the_same_files(unbroken, tmp_path, extra):
         process = _start(folder, "--resume", "--preview", *extra)
         assert process.communicate(timeout=200) == ("", "") and process.returncode == 0
     names = sorted(path.name for path in whole.iterdir())
-    assert len(names) == 16 + bool(extra)
+    assert len(names) == 16 + (extra is not PATH)
     leftovers = [path for path in broken.iterdir() if path.name not in names]
     assert leftovers == []
     for name in names:

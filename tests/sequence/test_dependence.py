@@ -157,14 +157,15 @@ CASES = {
     "cache": Case("", preset("cache")),
     "cache turning": Case("", preset("cache"), turning=True),
     "cache moving": Case("saved", preset("cache"), moving=True),
-    "clean": Case("unsaved", preset("clean"), moving=True),
+    "clean": Case("saved", preset("clean"), moving=True),
+    "clean blended": Case("saved", preset("clean", denoise=gi.SpatioTemporal(blend=0.25))),
     "transfer": Case("", preset("transfer")),
     "transfer turning": Case("", preset("transfer"), turning=True),
     "transfer moving": Case("", replace(preset("transfer"), indirect=None), moving=True),
     "probe_view": Case("", preset("probe_view")),
     "probe_view moving": Case("unsaved", preset("probe_view"), moving=True),
     "probe_view alone": Case("", preset("probe_view"), alone=True),
-    "denoised": Case("unsaved", preset("path", denoise="spatiotemporal"), moving=True),
+    "denoised": Case("saved", preset("path", denoise="spatiotemporal"), moving=True),
     "reuse, probes": Case("unsaved", preset("reuse", indirect=PROBES), turning=True),
 }
 

@@ -183,6 +183,16 @@ def test_a_turning_sky_is_resumed(tmp_path):
     assert plan.reason(1).startswith("scene_hash is ")
 
 
+def test_a_clean_sequence_under_a_turning_sky_is_resumed(tmp_path):
+    """Its cache follows the sky from frame to frame, and its denoiser the frames: both states are saved."""
+    scene, pipeline = box(gi.TurningSky(bright_side(), TURN, FPS)), gi.Pipeline.preset("clean")
+    wanted = [contents(frame) for frame in gi.render(scene, path(), pipeline, range(4), output=tmp_path / "a.####.exr")]
+    for _ in gi.render(scene, path(), pipeline, range(2), output=tmp_path / "b.####.exr"):
+        pass
+    again = gi.render(scene, path(), pipeline, range(4), output=tmp_path / "b.####.exr", resume=True)
+    assert_same([contents(frame) for frame in again], wanted[2:])
+
+
 def test_probes_under_a_turning_sky_start_over(tmp_path):
     """They begin with the sky of the first frame, also where that need not be rendered."""
     name, pattern = "probes of the first sky", tmp_path / "a.####.exr"

@@ -10,18 +10,18 @@ from warp_gi import registry
 from warp_gi.denoise import Denoiser, denoiser_named
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.frame import TERMS
-from warp_gi.pipeline import Pipeline, estimator_named
+from warp_gi.pipeline import NORMAL, Pipeline, estimator_named
 from warp_gi.radiance_cache import RadianceCache
 
 
-def pipeline_named(text: str) -> Pipeline:
+def pipeline_named(text: str, quality: str = NORMAL) -> Pipeline:
     """Return the pipeline of "path" or "path,indirect=none,emitters=UniformLights,denoise=SpatioTemporal".
 
     "indirect.ends_in=LightFieldProbes" lets the paths of a term end in a radiance cache. Raises OptionError for
     unknown presets, terms, estimators, caches and denoisers.
     """
     name, *changes = text.split(",")
-    pipeline = Pipeline.preset(name.strip())
+    pipeline = Pipeline.preset(name.strip(), quality=quality)
     for change in changes:
         place, _, value = (part.strip() for part in change.partition("="))
         term, _, inner = place.partition(".")

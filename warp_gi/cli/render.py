@@ -28,11 +28,12 @@ from warp_gi.cli.report import Reporter, run_command
 from warp_gi.errors import OptionError
 from warp_gi.files import check_writable
 from warp_gi.frame import Frame
-from warp_gi.pipeline import Pipeline
+from warp_gi.pipeline import DEFAULT, NORMAL, Pipeline
 from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.scene import Scene
 from warp_gi.scheduler import FrameScheduler
+from warp_gi.sequence.frame_time import parse_seconds, take_time
 from warp_gi.sequence.frames import parse_frames
 from warp_gi.sequence.resume import Output, Plan, SequenceRun, Shot, shots_of
 from warp_gi.techniques.reuse.pictures import check_pictures, reuse_pictures
@@ -46,7 +47,7 @@ Settings of the pipeline are flags by term: --indirect.max-depth 4. Where one es
 transfer, one flag sets both: --environment.resolution 512; give both flags for two values.
 
   warp-gi render
-  warp-gi render hall.glb --environment city.exr --camera path.json --frames 0-47 --spp 64
+  warp-gi render hall.glb --environment city.exr --camera path.json --frames 0-47
   warp-gi render hall.glb --eye 4 1.7 2 --target -3 1.6 -0.5 -o out/still.exr --preview
   warp-gi render hall.glb --pipeline dvf --bake out/hall.dvf.safetensors --environment-turn 2
   warp-gi render hall.glb --environment sky.####.exr --camera path.json --frames 0-47
@@ -62,8 +63,12 @@ class Render(SceneOptions):
 
     scene: Annotated[str, tyro.conf.Positional, flag("[SCENE]", f"{DEFAULT_SCENE}, with previews")] = ""
     """A GLB, glTF, OBJ or PLY file, the name of a built-in scene, or a bake of probes, .safetensors, to show alone."""
-    pipeline: Annotated[str, flag("NAME", "path; probe_view for a bake alone")] = ""
+    pipeline: Annotated[str, flag("NAME", f"{DEFAULT}; probe_view for a bake alone")] = ""
     """Preset, with estimators exchanged after commas: path,indirect=none. Its settings are the flags below."""
+    quality: Annotated[str, flag("NAME", "normal")] = ""
+    """draft, normal or high: the few settings of the pipeline that decide most. What flags say stands above it."""
+    frame_time: Annotated[str, flag("TIME", "as long as it takes")] = ""
+    """Time that a frame may take, as 0.5s or 500ms: samples a pixel are chosen to fit, one number for all frames."""
     denoise: Annotated[str, flag("NAME", "as the pipeline says: none")] = ""
     """Denoiser: none, oidn or spatiotemporal. Its settings are then flags below."""
     bake: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction, flag("FILE", "none; may be given more than once")] = ()
@@ -99,7 +104,7 @@ class Render(SceneOptions):
     """Print nothing but errors."""
     verbose: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print a table of the time of each stage."""
-    settings: Annotated[Pipeline, tyro.conf.arg(name="")] = field(default_factory=Pipeline)
+    settings: Annotated[Pipeline, tyro.conf.arg(name="")] = field(default_factory=lambda: Pipeline.preset(DEFAULT))
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -111,7 +116,8 @@ def parse(arguments: Sequence[str]) -> Render:
     """Return the options; the pipeline named among them decides which settings there are."""
     before = ["", *arguments]
     is_bake = any(a.endswith(BAKE_SUFFIX) and b != "--bake" for a, b in zip(arguments, before, strict=False))
-    settings = pipeline_named(value_given(arguments, "--pipeline") or ("probe_view" if is_bake else "path"))
+    named = value_given(arguments, "--pipeline") or ("probe_view" if is_bake else DEFAULT)
+    settings = pipeline_named(named, value_given(arguments, "--quality") or NORMAL)
     if denoiser := value_given(arguments, "--denoise"):
         settings = replace(settings, denoise=find_denoiser(denoiser))
     options = parse_options(Render, "render", arguments, DESCRIPTION, Render(settings=settings))
@@ -126,6 +132,7 @@ def run(options: Render, report: Reporter) -> None:
     if options.reuse_pixel is not None and options.reuse_pictures is None:
         raise OptionError("--reuse-pixel goes with --reuse-pictures; give that too")
     resolution = parse_resolution(options.resolution) if options.resolution else None
+    frame_time = parse_seconds(options.frame_time) if options.frame_time else None
     bakes = [load_bake(path) for path in options.bake]
     with report.phase("scene"):
         scene = BakedScene(load_bake(options.scene)) if options.scene.endswith(BAKE_SUFFIX) else find_scene(options)
@@ -143,6 +150,10 @@ def run(options: Render, report: Reporter) -> None:
     sequence = SequenceRun(scheduler, shots, find_output(options))
     with report.phase("bake"):
         sequence.bake()
+    if frame_time is not None:
+        with report.phase("timing of frames"):
+            samples = take_time(sequence, frame_time, options.resume)
+        report.line(f"{samples} sample{'s' * (samples != 1)} a pixel, as fits into {frame_time:g} s a frame")
     plan = sequence.plan(options.resume)
     if options.reuse_pictures is not None:
         if not plan.todo:
