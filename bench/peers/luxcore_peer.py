@@ -24,7 +24,7 @@ from warp_gi.color import decode_srgb
 
 PYTHON = os.environ.get("WARP_GI_LUXCORE_PYTHON", sys.executable)
 HOW_TO_INSTALL = (
-    "no module pyluxcore; install it with: pip install pyluxcore; "
+    "no module pyluxcore; install it with: pip install '.[luxcore]' (or pyluxcore alone); "
     "WARP_GI_LUXCORE_PYTHON names another Python that has it"
 )
 
@@ -120,7 +120,9 @@ def _camera(camera: gi.Camera) -> dict[str, Any]:
     matrix, (width, height) = camera.world_from_camera, camera.resolution
     eye = matrix[:3, 3]
     half = math.tan(math.radians(camera.hfov) / 2) * max(width, height) / width  # LuxCore's is of the longer side
+    x, y, row = (size / max(width, height) for size in (width, height, 2))
     return {
+        "window": [-x, x, -y - row, y - row],  # LuxCore 2.11 shows all one row lower than its window says
         "eye": eye.tolist(),
         "target": (eye - matrix[:3, 2]).tolist(),
         "up": matrix[:3, 1].tolist(),

@@ -80,6 +80,7 @@ def _camera(camera: dict[str, Any]) -> dict[str, Any]:
         "scene.camera.lookat.target": camera["target"],
         "scene.camera.up": camera["up"],
         "scene.camera.fieldofview": camera["angle"],
+        "scene.camera.screenwindow": camera["window"],
     }
 
 

@@ -114,9 +114,9 @@ BUILT_IN = (
 FROM_FILES = (
     SequenceCase("living_room", move=(0.45, 0.1, -0.45), size=LARGE, most_flip=0.06, within=0.02, most_seconds=0.45),
     SequenceCase("modern_hall", move=(-0.6, 0.0, -0.35), most_flip=0.07, within=0.02),
-    SequenceCase("sponza_courtyard", move=(2.0, 0.0, 0.0)),
-    SequenceCase("sponza", "Sponza, sun", (2.0, 0.0, 0.0), sunny_sponza),
-    SequenceCase("bistro", move=(2.0, 0.0, 1.6), within=0.05),
+    SequenceCase("sponza_courtyard", move=(2.0, 0.0, 0.0), reference_spp=512),
+    SequenceCase("sponza", "Sponza, sun", (2.0, 0.0, 0.0), sunny_sponza, reference_spp=512),
+    SequenceCase("bistro", move=(2.0, 0.0, 1.6), within=0.05, reference_spp=512),
 )
 MOVING = (
     SequenceCase("atrium", "atrium, sky turns", build=turning_atrium),
@@ -126,4 +126,4 @@ QUICK = (SequenceCase("cornell_box"),)
 
 ON, OFF = scenes.STROBE_PERIODS["jump"], scenes.STROBE_PERIODS["jump"] // 2
 """Frames in which the lamp of the room `scenes.strobe` comes out of its box, and goes into it."""
-SWITCHED = SequenceCase("strobe", "light switched", (-0.4, 0.0, -0.3))
+SWITCHED = SequenceCase("strobe", "light switched", (-0.4, 0.0, -0.3), reference_spp=64)

@@ -31,6 +31,7 @@ def first_rows(quick: bool, device: str) -> list[Row]:
         return [_row(WARM, timed_run([*QUICK_COMMAND, "--device", device], {}))]
     with tempfile.TemporaryDirectory() as kept:
         places = {"WARP_CACHE_PATH": f"{kept}/kernels", "XDG_CACHE_HOME": f"{kept}/caches"}
+        places["WARP_GI_BAKES"] = f"{kept}/bakes"
         return [_row(state, timed_run([*COMMAND, "--device", device], places)) for state in (COLD, WARM)]
 
 

@@ -2,4 +2,4 @@
 
 from warp_gi.bench.harness.sequences import Sequence
 
-CASES = {"clean": Sequence(("--pipeline", "clean"))}
+CASES = {"clean": Sequence(("--pipeline", "clean"), is_quick=False)}
