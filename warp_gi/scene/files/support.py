@@ -131,15 +131,15 @@ class Findings:
     """The features of one file that are not read in full, and where it uses them."""
 
     def __init__(self) -> None:
-        self.places: dict[str, list[str]] = {}
+        self.places: dict[str, dict[str, None]] = {}
         self.lost: list[str] = []
         """Messages about files that are not there, and without which the scene can be read."""
 
     def add(self, name: str, where: str = "") -> None:
         """Note that the file uses a feature in some place, such as "material 'paint'"."""
-        places = self.places.setdefault(name, [])
-        if where and where not in places:
-            places.append(where)
+        places = self.places.setdefault(name, {})
+        if where:
+            places[where] = None
 
     def messages(self, path: object) -> list[str]:
         """Return a line for each feature found."""
@@ -151,7 +151,7 @@ class Findings:
             if feature is not None and feature.status == "supported":
                 continue
             status, how = (feature.status, feature.how) if feature else ("ignored", "this library does not know it")
-            where = ", ".join(places[:MOST_PLACES])
+            where = ", ".join(list(places)[:MOST_PLACES])
             if len(places) > MOST_PLACES:
                 where += f" and {len(places) - MOST_PLACES:,} more"
             lines.append(f"{str(path)!r} uses {name}{f' ({where})' if where else ''}, which is {status}: {how}")
