@@ -155,7 +155,7 @@ def test_emitters_are_placed_without_a_download(monkeypatch):
 
 
 def test_bounds_hold_every_pose_of_a_key():
-    """A chain below a node that rests, with clocks of its own and a link without keys: as of all corners at all keys."""
+    """A chain below a node that rests, with clocks of its own and a link without keys."""
     rng = np.random.default_rng(5)
     nodes = [Node("rest", [card()], np.diag([1.0, 2.0, 1.0, 1.0]))]
     for i in range(5):
