@@ -326,8 +326,8 @@ BROKEN = {
         "unknown wrap mode '7'",
     ),
     "cutoff": (
-        edited(lambda glb, _: glb.json["materials"][0].update(alphaMode="MASK", alphaCutoff=2.0)),
-        "'plank': alpha_cutoff must be from 0 to 1",
+        edited(lambda glb, _: glb.json["materials"][0].update(alphaMode="MASK", alphaCutoff=-2.0)),
+        "'plank': alpha_cutoff must be from 0 to inf, got -2",
     ),
 }
 

@@ -144,3 +144,22 @@ def test_a_mask_of_gltf_with_colors(tmp_path):
     rays = np.float32([[0.4, 0.2, 1], [0.6, 0.2, 1]])
     np.testing.assert_array_equal(scene.bvh("cpu").intersect(rays, np.float32([[0, 0, -1]] * 2)).face.numpy(), [-1, 0])
     assert TRIANGLE_POINTS[1, 0] == 1.0
+
+
+@pytest.mark.parametrize(
+    "preset", ["path", "cache", *(pytest.param(one, marks=pytest.mark.slow) for one in ("transfer", "probes"))]
+)
+def test_every_technique_reads_the_colors(preset):
+    """A room of white walls with colours is the room of walls that have these colours themselves."""
+    reds, whites = gi.builtin_scene("cornell_box"), gi.builtin_scene("cornell_box")
+    for node in whites.nodes:
+        for mesh in node.meshes:
+            color = np.float32(mesh.material.base_color)
+            mesh.colors = np.tile(color, (len(mesh.points), 1))
+            mesh.material = replace(mesh.material, base_color=(1.0, 1.0, 1.0))
+    camera = gi.builtin_camera_path("cornell_box").camera_at(0.0).at_resolution(24, 24)
+    pictures = []
+    for scene in (reds, gi.Scene(whites.nodes, whites.lights, whites.environment)):
+        pictures.append(next(gi.render(scene, camera, gi.Pipeline.preset(preset), seed=1)).numpy("beauty"))
+    assert pictures[0].mean() > 0.01
+    np.testing.assert_allclose(pictures[1], pictures[0], rtol=2e-3, atol=2e-4)

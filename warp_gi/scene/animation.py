@@ -103,31 +103,44 @@ def box_corners(node: Node) -> np.ndarray:
     return np.concatenate(corners)
 
 
-def swept_box(nodes: Sequence[Node], moving: Sequence[bool], times: np.ndarray) -> np.ndarray:
-    """Return a box around all poses that moving meshes have at ``times`` [s]: low and high corner, float64 [2, 3]."""
-    needed = [False] * len(nodes)  # nodes with moving meshes, and those above them
-    for index in reversed(range(len(nodes))):
-        needed[index] |= moving[index] and any(len(mesh.points) for mesh in nodes[index].meshes)
-        parent = nodes[index].parent
-        if needed[index] and parent is not None:
-            needed[parent] = True
-    corners = {i: box_corners(nodes[i]) for i in range(len(nodes)) if needed[i] and moving[i] and nodes[i].meshes}
+def swept_box(nodes: Sequence[Node], moving: Sequence[bool], evenly: np.ndarray) -> np.ndarray:
+    """Return a box around the poses of moving meshes: low and high corner, float64 [2, 3].
+
+    The poses are those at the keys of whatever moves together, and at the times ``evenly`` [s].
+    """
+    rest, top = world_matrices(nodes, 0.0), list(range(len(nodes)))
+    groups: dict[int, list[int]] = {}
+    for index, node in enumerate(nodes):
+        if node.parent is not None and moving[node.parent]:
+            top[index] = top[node.parent]
+        if moving[index]:
+            groups.setdefault(top[index], []).append(index)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    step = max(POSES_AT_ONCE // max(sum(needed), 1), 16)
-    for start in range(0, len(times), step):
-        part = times[start : start + step]
-        world: dict[int, np.ndarray] = {}
-        for index, node in enumerate(nodes):
-            if not needed[index]:
-                continue
-            keys = node.keyframes
-            local = _keyframe_matrices(keys, part) if keys else np.asarray(node.parent_from_node, np.float64)
-            world[index] = local if node.parent is None else world[node.parent] @ local
-            if index in corners:
-                points = world[index][..., None, :3, :3] @ corners[index][..., None]
-                points = points[..., 0] + world[index][..., None, :3, 3]
-                flat = points.reshape(-1, 3)
-                low, high = np.minimum(low, flat.min(axis=0)), np.maximum(high, flat.max(axis=0))
+    for group in groups.values():
+        if any(nodes[index].meshes for index in group):
+            times = np.union1d(evenly, key_times([nodes[index] for index in group]))
+            step = max(POSES_AT_ONCE // len(group), 16)
+            for start in range(0, len(times), step):
+                box = _group_box(nodes, group, rest, times[start : start + step])
+                low, high = np.minimum(low, box[0]), np.maximum(high, box[1])
+    return np.stack([low, high])
+
+
+def _group_box(nodes: Sequence[Node], group: list[int], rest: list[np.ndarray], times: np.ndarray) -> np.ndarray:
+    """Return a box around all meshes of a group of nodes at all ``times`` [s]; ``rest`` places what does not move."""
+    world: dict[int, np.ndarray] = {}
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for index in group:
+        node = nodes[index]
+        keys = node.keyframes
+        placed = _keyframe_matrices(keys, times) if keys else np.asarray(node.parent_from_node, np.float64)
+        if node.parent is not None:
+            placed = (world[node.parent] if node.parent in world else rest[node.parent]) @ placed
+        world[index] = placed
+        if any(len(mesh.points) for mesh in node.meshes):
+            matrices = placed.reshape(-1, 4, 4)
+            points = np.matmul(box_corners(node), matrices[:, :3, :3].transpose(0, 2, 1)) + matrices[:, None, :3, 3]
+            low, high = np.minimum(low, points.min(axis=(0, 1))), np.maximum(high, points.max(axis=(0, 1)))
     return np.stack([low, high])
 
 

@@ -5,16 +5,21 @@ from __future__ import annotations
 import os
 import struct
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from warp_gi.errors import OptionError, SceneError, one_line
 from warp_gi.scene.environment import Sky
+from warp_gi.scene.files.from_trimesh import is_trimesh, trimesh_parts
 from warp_gi.scene.files.images import missing_file
 from warp_gi.scene.files.parts import SceneParts
 from warp_gi.scene.geometry import triangulated
 from warp_gi.scene.model import Material, Mesh, Node
 from warp_gi.scene.scene import Scene
+
+if TYPE_CHECKING:
+    import trimesh
 
 EXTENSIONS = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
 
@@ -23,12 +28,16 @@ DAMAGE = (ArithmeticError, AttributeError, EOFError, LookupError, NameError, OSE
 
 
 def load_scene(
-    path: str | os.PathLike[str], environment: Sky = None, smooth: float | None = None, scale: float = 1.0
+    path: str | os.PathLike[str] | trimesh.Trimesh | trimesh.Scene,
+    environment: Sky = None,
+    smooth: float | None = None,
+    scale: float = 1.0,
 ) -> Scene:
-    """Load a scene from a GLB, glTF, OBJ (with MTL), PLY, STL or OFF file.
+    """Load a scene from a GLB, glTF, OBJ (with MTL), PLY, STL or OFF file, or from an object of trimesh.
 
     Args:
-        path: The file; textures and buffers it names are looked up beside it.
+        path: The file; textures and buffers it names are looked up beside it. Or a ``trimesh.Trimesh`` or
+            ``trimesh.Scene``, whose materials, colours and transforms are taken.
         environment: A path to a sky map, an RGB radiance, an Environment, a SunSky, or None for black.
         smooth: Crease angle in degrees. Meshes without normals get smooth ones except across
             edges that bend more than this; None leaves them flat, as glTF asks.
@@ -37,18 +46,36 @@ def load_scene(
     Gives an UnsupportedWarning for each feature that the file uses and this library does not read in full.
     Raises SceneError if the file or anything it names is missing, damaged or unusable: one line.
     """
-    path = Path(path)
+    if smooth is not None and not 0.0 <= smooth <= 180.0:
+        raise OptionError(f"smooth must be an angle from 0 to 180 degrees, got {smooth}")
+    if not (np.isfinite(scale) and scale > 0.0):
+        raise OptionError(f"scale must be a finite number above 0, got {scale}")
+    if isinstance(path, str | os.PathLike):
+        path = Path(path)
+        name, told, parts = path.stem, str(path), _file_parts(path)
+    elif is_trimesh(path):
+        name, told, parts = "trimesh", "the trimesh object", trimesh_parts(path)
+    else:
+        raise OptionError(f"expected the path of a scene file or an object of trimesh, got a {type(path).__name__}")
+    parts.findings.warn(told, stacklevel=2)
+    if smooth is not None:
+        parts = parts.smoothed(smooth)
+    if scale != 1.0:
+        parts = parts.scaled(scale)
+    if not any(len(mesh.indices) for node in parts.nodes for mesh in node.meshes):
+        raise SceneError(f"{told!r} holds no triangles; export it with faces")
+    return Scene(parts.nodes, parts.lights, environment, parts.cameras, name, parts.camera_nodes)
+
+
+def _file_parts(path: Path) -> SceneParts:
+    """Return the contents of a scene file."""
     suffix = path.suffix.lower()
     if not path.is_file():
         raise missing_file(path, "scene file")
     if suffix not in EXTENSIONS:
         raise SceneError(f"{str(path)!r}: unknown kind of file {suffix!r}; expected one of {', '.join(EXTENSIONS)}")
-    if smooth is not None and not 0.0 <= smooth <= 180.0:
-        raise OptionError(f"smooth must be an angle from 0 to 180 degrees, got {smooth}")
-    if not (np.isfinite(scale) and scale > 0.0):
-        raise OptionError(f"scale must be a finite number above 0, got {scale}")
     try:
-        parts = _read(path, suffix)
+        return _read(path, suffix)
     except SceneError:
         raise
     except (*DAMAGE, struct.error) as error:
@@ -57,14 +84,6 @@ def load_scene(
         raise SceneError(
             f"{str(path)!r} cannot be read as {kind} ({type(error).__name__}: {reason}); export or copy it again"
         ) from error
-    parts.findings.warn(path, stacklevel=2)
-    if smooth is not None:
-        parts = parts.smoothed(smooth)
-    if scale != 1.0:
-        parts = parts.scaled(scale)
-    if not any(len(mesh.indices) for node in parts.nodes for mesh in node.meshes):
-        raise SceneError(f"{str(path)!r} holds no triangles; export it with faces")
-    return Scene(parts.nodes, parts.lights, environment, parts.cameras, path.stem, parts.camera_nodes)
 
 
 def _read(path: Path, suffix: str) -> SceneParts:

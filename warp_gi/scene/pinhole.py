@@ -35,6 +35,9 @@ class Camera:
     """Width and height in pixels."""
     name: str = ""
     """Name in messages and reports."""
+    keeps_vertical: bool = False
+    """Whether a picture of another shape keeps the vertical field of view, as a glTF camera without an aspect ratio
+    asks; else it keeps the horizontal one."""
 
     def __post_init__(self) -> None:
         matrix = np.array(self.world_from_camera, dtype=np.float64)
@@ -78,8 +81,12 @@ class Camera:
         return cls(_look_at_matrix(eye, target, up), hfov, resolution, name)
 
     def at_resolution(self, width: int, height: int) -> Camera:
-        """Return the same camera with another resolution."""
-        return replace(self, resolution=(width, height))
+        """Return the same camera with another resolution; see ``keeps_vertical`` for another shape."""
+        hfov, (old_width, old_height) = self.hfov, self.resolution
+        if self.keeps_vertical and width > 0 and height > 0 and width * old_height != height * old_width:
+            half = math.tan(math.radians(hfov) / 2) * old_height / old_width
+            hfov = math.degrees(2 * math.atan(half * width / height))
+        return replace(self, resolution=(width, height), hfov=hfov)
 
     @property
     def position(self) -> np.ndarray:

@@ -374,8 +374,8 @@ class Scene:
         boxes = [np.stack([flat.points[used].min(axis=0), flat.points[used].max(axis=0)])]
         if self.is_animated:
             evenly = np.linspace(0.0, self.duration, POSES_FOR_BOUNDS)
-            times = np.union1d(evenly, animation.key_times(self.nodes))
-            boxes.append(animation.swept_box(self.nodes, self._moving, times))
+            swept = animation.swept_box(self.nodes, self._moving, evenly)
+            boxes += [swept] if np.isfinite(swept).all() else []
         return np.stack([np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))]).astype(np.float32)
 
 

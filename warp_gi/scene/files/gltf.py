@@ -24,8 +24,6 @@ from warp_gi.scene.model import Node, PunctualLight
 from warp_gi.scene.pinhole import Camera
 
 CAMERA_HEIGHT = 540  # pixels; a glTF camera has a shape but no resolution
-NOTED_IN_DETAIL = {"KHR_materials_specular", "KHR_texture_transform", "EXT_texture_webp"}
-"""Extensions of which the readers note just what they leave out."""
 
 
 def read_gltf(path: Path) -> SceneParts:
@@ -39,7 +37,7 @@ def read_gltf(path: Path) -> SceneParts:
 
 def _check_extensions(document: Document) -> None:
     """Raise SceneError for required extensions that are not supported, and note others that are not read in full."""
-    read = {name for name, one in BY_NAME.items() if one.status in ("supported", "approximated")} | NOTED_IN_DETAIL
+    read = {name for name, one in BY_NAME.items() if one.status in ("supported", "approximated")}
     unknown = sorted({str(name) for name in document.root.get("extensionsRequired") or ()} - read)
     if unknown:
         raise SceneError(
@@ -47,7 +45,7 @@ def _check_extensions(document: Document) -> None:
         )
     for name, places in document.used_extensions().items():
         feature = BY_NAME.get(name)
-        if name in NOTED_IN_DETAIL or (feature is not None and feature.status in ("supported", "refused")):
+        if feature is not None and feature.status in ("supported", "refused"):
             continue  # a file that can do without what is refused has other data beside it
         for place in places or ("",):
             document.findings.add(name, place)
@@ -78,6 +76,9 @@ class _Reader:
             sources.append((source, owner))
             nodes.append(self._node(source, owner, names, parent))
             nodes[-1].keyframes = keyframes.get(index)
+            for copy in self._instances(source, owner, nodes[-1], names, len(nodes) - 1):
+                nodes.append(copy)
+                sources.append(({}, owner))
         return self._with_lights_and_cameras(nodes, sources)
 
     def _node(self, source: Part, owner: str, names: _Names, parent: int | None) -> Node:
@@ -91,6 +92,27 @@ class _Reader:
         if source.get("mesh") is not None:
             meshes = list(self.meshes.meshes(document.whole(source, "mesh", owner), owner, weights))
         return Node(names.unique(document.text(source, "name") or owner), meshes, self._matrix(source, owner), parent)
+
+    def _instances(self, source: Part, owner: str, node: Node, names: _Names, index: int) -> list[Node]:
+        """Return the copies of a node's meshes that EXT_mesh_gpu_instancing asks for, and take them from the node."""
+        extension = self.document.extension(source, "EXT_mesh_gpu_instancing", owner)
+        if extension is None or not node.meshes:
+            return []
+        given = self.document.part(extension, "attributes", owner) or {}
+        widths = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}
+        values = {
+            name: self.buffers.accessor(given[name], f"{name} of {owner}", (width,))
+            for name, width in widths.items()
+            if given.get(name) is not None
+        }
+        counts = {len(one) for one in values.values()}
+        if len(counts) > 1:
+            raise self.document.error(owner, f"its instances have {' and '.join(map(str, sorted(counts)))} values")
+        count = counts.pop() if counts else 0
+        rest = {"TRANSLATION": (0.0,) * 3, "ROTATION": (0.0, 0.0, 0.0, 1.0), "SCALE": (1.0,) * 3}
+        matrices = pose_matrix(*(values.get(name, np.tile(one, (count, 1))) for name, one in rest.items()))
+        meshes, node.meshes = node.meshes, []
+        return [Node(names.unique(f"{node.name} {i + 1}"), list(meshes), one, index) for i, one in enumerate(matrices)]
 
     def _matrix(self, source: Part, owner: str) -> np.ndarray:
         if source.get("matrix") is not None:
@@ -148,9 +170,11 @@ class _Reader:
             document.findings.add("orthographic cameras", what)
             return None
         aspect = document.number(lens, "aspectRatio", what, 16.0 / 9.0)
-        hfov = 2.0 * math.degrees(math.atan(math.tan(document.number(lens, "yfov", what) / 2.0) * aspect))
+        vfov = document.number(lens, "yfov", what)
+        hfov = 2.0 * math.degrees(math.atan(math.tan(vfov / 2.0) * aspect))
         resolution = (max(1, round(CAMERA_HEIGHT * aspect)), CAMERA_HEIGHT)
-        return Camera(world_from_node, hfov, resolution, document.text(source, "name") or node)
+        name = document.text(source, "name") or node
+        return Camera(world_from_node, hfov, resolution, name, keeps_vertical=lens.get("aspectRatio") is None)
 
     def _light(self, source: Part, node: str) -> PunctualLight:
         document = self.document

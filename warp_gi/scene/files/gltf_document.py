@@ -28,6 +28,7 @@ class Document:
 
     def __init__(self, text: bytes, path: Path) -> None:
         self.path, self.findings = path, Findings()
+        self._checked: dict[str, list[Part]] = {}
         try:
             root = json.loads(text.decode("utf-8-sig"))
         except (ValueError, RecursionError) as error:
@@ -65,9 +66,12 @@ class Document:
 
     def items(self, kind: str) -> list[Part]:
         """Return a list at the top of the document, such as "nodes"; empty if there is none."""
+        if kind in self._checked:
+            return self._checked[kind]
         values = self.root.get(kind) or []
         if not isinstance(values, list) or not all(isinstance(value, dict) for value in values):
             raise self.error(kind, "must be a list of objects")
+        self._checked[kind] = values
         return values
 
     def item(self, kind: str, index: object, owner: str) -> Part:
@@ -154,7 +158,7 @@ class Document:
                         for name in _extensions(value):
                             places = found.setdefault(name, [])
                             place = self.name(kind, index)
-                            if place not in places:
+                            if not places or places[-1] != place:
                                 places.append(place)
         for name in self.part(self.root, "extensions", "the file") or {}:
             found.setdefault(name, [])

@@ -9,7 +9,7 @@ import numpy as np
 
 from warp_gi.scene.files.gltf_buffers import Buffers
 from warp_gi.scene.files.gltf_document import Document, Part
-from warp_gi.scene.files.gltf_materials import MaterialReader, texture_transform
+from warp_gi.scene.files.gltf_materials import Coordinates, MaterialReader
 from warp_gi.scene.model import Mesh
 
 TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN = 4, 5, 6
@@ -65,14 +65,18 @@ class MeshReader:
         if any(weights):
             points, normals = self._morphed(source, owner, weights, points, normals)
         index = None if source.get("material") is None else document.whole(source, "material", owner)
+        material, coordinates = self.materials.material(index, owner)
         self._note(attributes, owner)
         return Mesh(
             points,
             _triangles(corners.astype(np.int64), mode),
-            self.materials.material(index, owner),
+            material,
             None if normals is None else np.ascontiguousarray(normals, np.float32),
-            None if index is None else self._uvs(attributes, index, owner, len(points)),
+            self._uvs(attributes, coordinates, owner, len(points)),
             label,
+            further_uvs=None
+            if coordinates.further is None
+            else self._uvs(attributes, Coordinates(coordinates.further), owner, len(points)),
             colors=self._colors(attributes, owner, len(points)),
         )
 
@@ -87,14 +91,12 @@ class MeshReader:
             raise self.document.error(owner, f"has {count} positions and {len(values)} values of {name}")
         return values
 
-    def _uvs(self, attributes: Part, material: int, owner: str, count: int) -> np.ndarray | None:
+    def _uvs(self, attributes: Part, wanted: Coordinates, owner: str, count: int) -> np.ndarray | None:
         """Return the texture coordinates that a material asks for, v up."""
-        source = self.document.items("materials")[material]
-        coordinates, transform = texture_transform(self.document, source, self.document.name("materials", material))
-        uvs = self._attribute(attributes, f"TEXCOORD_{coordinates}", owner, count, (2,))
+        uvs = self._attribute(attributes, f"TEXCOORD_{wanted.number}", owner, count, (2,))
         if uvs is None:
             return None
-        uvs = uvs @ transform[:2, :2].T.astype(np.float32) + transform[:2, 2]
+        uvs = uvs @ wanted.transform[:2, :2].T.astype(np.float32) + wanted.transform[:2, 2]
         return np.stack([uvs[:, 0], 1.0 - uvs[:, 1]], axis=1).astype(np.float32)
 
     def _colors(self, attributes: Part, owner: str, count: int) -> np.ndarray | None:

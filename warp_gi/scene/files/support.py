@@ -46,12 +46,18 @@ FEATURES: tuple[Feature, ...] = (
         ("EXT_texture_webp", GLTF, "read in the place of its stand-in"),
         ("sparse, strided and normalized accessors", GLTF, "as they are"),
         ("KHR_mesh_quantization", GLTF, "as it is"),
+        ("EXT_mesh_gpu_instancing", GLTF, "a node for each instance"),
+        ("KHR_materials_specular", GLTF, "factor, colour and both textures"),
+        ("KHR_materials_ior", GLTF, "the reflectance at normal incidence; nothing refracts"),
+        ("KHR_texture_transform", GLTF, "one for each texture"),
+        ("two sets of texture coordinates", GLTF, "for the textures of one material"),
+        ("NEAREST filtering", GLTF, "where magFilter says so; mipmaps are not used"),
         ("hierarchy and animation of nodes", GLTF, "cubic splines as 16 linear pieces from key to key"),
-        ("metallic-roughness materials", GLTF, "as they are; texture lookups are bilinear"),
+        ("metallic-roughness materials", GLTF, "as they are; texture lookups are bilinear, or take the nearest texel"),
         ("KHR_materials_emissive_strength", GLTF, "as it is"),
         ("KHR_lights_punctual", GLTF, "intensities are taken as W/sr and W/m², without conversion"),
         ("alphaMode MASK", GLTF, "rays pass where the coverage is below the cutoff"),
-        ("perspective cameras", GLTF, "as they are"),
+        ("perspective cameras", GLTF, "without aspectRatio they keep their yfov in pictures of any shape"),
         ("polygons, concave ones too", f"{OBJ}, {PLY}", "triangles: fans, or ear clipping of concave ones"),
         ("MTL: Kd, Ks, Ns, Ke, d, Tr, Pr, Pm and their maps", OBJ, "metallic-roughness materials"),
         ("textures named by a path of another machine", OBJ, "looked for by their bare names beside the MTL file"),
@@ -59,9 +65,9 @@ FEATURES: tuple[Feature, ...] = (
     *_features(
         "approximated",
         ("alphaMode BLEND", GLTF, "a mask with a cutoff of 0.5"),
-        ("KHR_materials_specular", GLTF, "the factor alone"),
-        ("KHR_texture_transform", GLTF, "one transform for all textures of a material"),
-        ("a second set of texture coordinates", GLTF, "one set for all textures of a material"),
+        ("KHR_materials_pbrSpecularGlossiness", GLTF, "converted to metallic-roughness; pure Lambert without specular"),
+        ("KHR_materials_unlit", GLTF, "emits its base colour, reflects nothing, and lights what is around it"),
+        ("a third set of texture coordinates", GLTF, "two sets for the textures of a material"),
         ("KHR_materials_variants", GLTF, "the materials without a variant"),
         ("coverage between 0 and 1", OBJ, "a mask with a cutoff of 0.5"),
         ("one scale and offset a map (-s, -o)", OBJ, "one for all maps of a material"),
@@ -79,14 +85,10 @@ FEATURES: tuple[Feature, ...] = (
         ("orthographic cameras", GLTF, "left out"),
         ("further scenes", GLTF, "the default scene is read, else the first"),
         ("tangents", GLTF, "tangents follow from texture coordinates"),
-        ("EXT_mesh_gpu_instancing", GLTF, "the node stands once, where it is"),
-        ("KHR_materials_unlit", GLTF, "lit as any surface"),
-        ("KHR_materials_pbrSpecularGlossiness", GLTF, "the metallic-roughness values beside it"),
         ("KHR_materials_transmission", GLTF, "opaque"),
         ("KHR_materials_volume", GLTF, "surfaces enclose nothing"),
         ("KHR_materials_volume_scatter", GLTF, "surfaces enclose nothing"),
         ("KHR_materials_diffuse_transmission", GLTF, "opaque"),
-        ("KHR_materials_ior", GLTF, "the reflectance of an index of refraction of 1.5"),
         ("KHR_materials_clearcoat", GLTF, "the surface below the coat"),
         ("KHR_materials_sheen", GLTF, "the surface below the sheen"),
         ("KHR_materials_iridescence", GLTF, "the surface without a film"),
@@ -129,15 +131,15 @@ class Findings:
     """The features of one file that are not read in full, and where it uses them."""
 
     def __init__(self) -> None:
-        self.places: dict[str, list[str]] = {}
+        self.places: dict[str, dict[str, None]] = {}
         self.lost: list[str] = []
         """Messages about files that are not there, and without which the scene can be read."""
 
     def add(self, name: str, where: str = "") -> None:
         """Note that the file uses a feature in some place, such as "material 'paint'"."""
-        places = self.places.setdefault(name, [])
-        if where and where not in places:
-            places.append(where)
+        places = self.places.setdefault(name, {})
+        if where:
+            places[where] = None
 
     def messages(self, path: object) -> list[str]:
         """Return a line for each feature found."""
@@ -149,7 +151,7 @@ class Findings:
             if feature is not None and feature.status == "supported":
                 continue
             status, how = (feature.status, feature.how) if feature else ("ignored", "this library does not know it")
-            where = ", ".join(places[:MOST_PLACES])
+            where = ", ".join(list(places)[:MOST_PLACES])
             if len(places) > MOST_PLACES:
                 where += f" and {len(places) - MOST_PLACES:,} more"
             lines.append(f"{str(path)!r} uses {name}{f' ({where})' if where else ''}, which is {status}: {how}")
