@@ -132,6 +132,9 @@ class PathCache(NamedTuple):
     # (data, surface, wo) -> probability with which a path goes on by the GGX lobe alone, which is not in what is known;
     # 0: it is. Asked where the path would end in a cache that holds direct light.
     lobe: wp.Function | None = None
+    # Whether `lookup`, and `lobe` where it tells 0 from more, go by place, geometric normal and BSDF alone. The frame
+    # of shading and wo, which are zero there, are then worked out where a path goes on: a third of a surface's time.
+    by_place: bool = False
 
 
 # What a radiance cache says of a vertex.

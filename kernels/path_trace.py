@@ -68,7 +68,9 @@ from warp_gi.kernels.sampling import (
 )
 from warp_gi.kernels.surface import (
     Surface,
+    bare_surface,
     ray_origin,
+    shading_frame,
     surface_at,
     surface_emission,
     surface_prefetch,
@@ -175,6 +177,7 @@ def _made(
     holds_direct, lobe_probability = cache.holds_direct, cache.lobe or no_lobe
     sky_data, cache_data, has_cache = sky.data, cache.data, cache is not NO_CACHE
     apart, parts_lights = sky.apart, sky.apart is not None
+    shades_late = cache.by_place and regions is NO_REGIONS
     explore, choices = (no_light, 1) if lights.explore is None else (lights.explore, 2)
 
     @wp.struct
@@ -214,6 +217,7 @@ def _made(
         samples_sky = sky.is_sampled(samplers.sky, scene)
         sharpness = float(wp.inf)
         corrects = bool(False)
+        is_bare = bool(False)  # without its frame of shading yet
         # light before the way on from the first vertex, and the diffuse lobe's share of what comes from there
         before = wp.vec3(0.0, 0.0, 0.0)
         diffuse_share = wp.vec3(0.0, 0.0, 0.0)
@@ -245,6 +249,12 @@ def _made(
                         ends = random_1d(index, seed, d + CACHE_DIMENSION) < known.validity
                     if ends:
                         r.indirect = r.indirect + wp.cw_mul(throughput, known.radiance)
+                    if shades_late:
+                        is_read = ends and known.follow <= 0.0 and lobe_probability(samplers.cache, s, wo) <= 0.0
+                        if is_bare and not is_read:
+                            s.shading = shading_frame(scene, hit.face, hit.u, hit.v, s.uv, view)
+                            wo = wp.transpose(s.shading) * view
+                        is_bare = False
                     if holds_direct:
                         if ends:
                             goes = lobe_probability(samplers.cache, s, wo)
@@ -452,7 +462,12 @@ def _made(
             if has_cache:
                 sharpness = wp.min(sharpness, b.pdf)
             view = -wi
-            s = surface_shape(scene, hit.face, hit.u, hit.v, view)
+            if shades_late:
+                is_bare = not corrects and depth >= paths.cache_vertex
+            if is_bare:
+                s = bare_surface(scene, hit.face, hit.u, hit.v, view, 0)
+            else:
+                s = surface_shape(scene, hit.face, hit.u, hit.v, view)
         if slot >= 0:
             regions.end(samplers.regions, slot, vertices, luminance(r.environment + r.indirect))
         if paths.lobes != 0:

@@ -179,6 +179,22 @@ def sample_1d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32) -> wp.floa
 def random_1d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32) -> wp.float32: ...
 
 
+PAIR_SALT = wp.constant(wp.uint32(0x9E3779B9))
+NUMBER_SALT = wp.constant(wp.uint32(0x85EBCA6B))
+
+
+# The hashes of seed and dimension within sample_2d, and within random_1d, for code that draws many numbers.
+@wp.func
+def pair_keys(seed: wp.uint32, dimension: wp.int32) -> wp.vec3ui:
+    key = hash_uint(seed ^ hash_uint(wp.uint32(dimension) + PAIR_SALT))
+    return wp.vec3ui(key, hash_uint(key + wp.uint32(1)), hash_uint(key + wp.uint32(2)))
+
+
+@wp.func
+def random_key(seed: wp.uint32, dimension: wp.int32) -> wp.uint32:
+    return hash_uint(seed + hash_uint(wp.uint32(dimension) + NUMBER_SALT))
+
+
 # (cos, sin) of 2 pi u for u in [0, 1]; polynomials, so no call breaks a loop, and every machine agrees.
 @wp.func
 def circle(u: wp.float32) -> wp.vec2:

@@ -247,30 +247,15 @@ def coated_bsdf(
     return make_coated_bsdf(base, metallic, roughness, specular, reflectance)
 
 
-# The point (u, v) of triangle `face` seen from direction wo, all but the texture of a Lambert
-# material: where to go on from there does not depend on it, so a path asks for it (`with_color`)
-# after the next ray, when it has arrived.
+# Frame of shading at the point (u, v) of triangle `face` with coordinates uv, seen from direction wo.
 @wp.func
-def surface_shape(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, wo: wp.vec3) -> Surface:
-    s = Surface()
+def shading_frame(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, uv: wp.vec2, wo: wp.vec3) -> wp.mat33:
     g = scene.geometry
     ids = g.indices[face]
     m = scene.materials[g.materials[face]]
-    s.texture = -1
-    textured = m.metallic_roughness_texture >= 0 or m.specular_texture >= 0 or m.reflectance_texture >= 0
-    if textured or m.base_color_texture >= 0 or m.normal_texture >= 0:
-        s.uv = triangle_uv(scene, face, u, v)
-    if m.base_color_texture >= 0:
-        s.texture = m.base_color_texture
-        texture_prefetch(scene.texels, scene.textures[m.base_color_texture], s.uv[0], s.uv[1])
     p0 = g.points[ids[0]]
-    p1 = g.points[ids[1]]
-    p2 = g.points[ids[2]]
-    w = 1.0 - u - v
-    s.position = p0 * w + p1 * u + p2 * v
-    s.offset = ray_offset(s.position, scene.radius)
-    normal = wp.normalize(wp.cross(p1 - p0, p2 - p0))
-    shading = g.normals[ids[0]] * w + g.normals[ids[1]] * u + g.normals[ids[2]] * v
+    normal = wp.normalize(wp.cross(g.points[ids[1]] - p0, g.points[ids[2]] - p0))
+    shading = g.normals[ids[0]] * (1.0 - u - v) + g.normals[ids[1]] * u + g.normals[ids[2]] * v
     length = wp.length(shading)
     if length <= 1.0e-6:
         shading = normal
@@ -279,17 +264,49 @@ def surface_shape(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32
     else:  # files whose normals point to the back of their triangles
         shading = shading / -length
     if m.normal_texture >= 0:
-        at = texture_uv(scene, m.normal_texture, face, u, v, s.uv)
+        at = texture_uv(scene, m.normal_texture, face, u, v, uv)
         shading = mapped_normal(scene, m.normal_texture, m.normal_scale, face, at, shading)
     if wp.dot(normal, wo) < 0.0:
-        normal = -normal
         shading = -shading
-    s.normal = normal
     # an interpolated normal may face away from the viewer: bend it until it just does not
     slant = wp.dot(shading, wo)
     if slant < 1.0e-3:
         shading = wp.normalize(shading + wo * (1.0e-3 - slant) * 1.001)
-    s.shading = frame_of(shading)
+    return frame_of(shading)
+
+
+# Starts fetching the texels that the shading of a point needs beside its colour.
+@wp.func
+def shading_prefetch(scene: SceneData, texture: wp.int32, uv: wp.vec2):
+    if texture >= 0:
+        texture_prefetch(scene.texels, scene.textures[texture], uv[0], uv[1])
+
+
+# As surface_shape, but for the frame of shading, which is zero, and normal maps with it: what a look-up by place needs.
+@wp.func
+def bare_surface(
+    scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, wo: wp.vec3, fetches_normals: wp.int32
+) -> Surface:
+    s = Surface()
+    g = scene.geometry
+    ids = g.indices[face]
+    m = scene.materials[g.materials[face]]
+    s.texture = m.base_color_texture
+    textured = m.metallic_roughness_texture >= 0 or m.specular_texture >= 0 or m.reflectance_texture >= 0
+    if textured or m.base_color_texture >= 0 or m.normal_texture >= 0:
+        s.uv = triangle_uv(scene, face, u, v)
+        shading_prefetch(scene, m.base_color_texture, s.uv)
+        shading_prefetch(scene, m.metallic_roughness_texture, s.uv)
+        if fetches_normals != 0:
+            shading_prefetch(scene, m.normal_texture, s.uv)
+    p0 = g.points[ids[0]]
+    p1 = g.points[ids[1]]
+    p2 = g.points[ids[2]]
+    s.position = p0 * (1.0 - u - v) + p1 * u + p2 * v
+    s.offset = ray_offset(s.position, scene.radius)
+    s.normal = wp.normalize(wp.cross(p1 - p0, p2 - p0))
+    if wp.dot(s.normal, wo) < 0.0:
+        s.normal = -s.normal
     s.base_color = m.base_color
     if g.colors.shape[0] > 0:
         s.base_color = wp.cw_mul(s.base_color, vertex_color(scene, face, u, v))
@@ -298,6 +315,16 @@ def surface_shape(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32
         s.bsdf = coated_bsdf(scene, m, s.base_color, face, u, v, s.uv)
     else:
         s.bsdf = make_bsdf(s.base_color, 0.0, 1.0, 0.0)
+    return s
+
+
+# The point (u, v) of triangle `face` seen from direction wo, all but the texture of a Lambert
+# material: where to go on from there does not depend on it, so a path asks for it (`with_color`)
+# after the next ray, when it has arrived.
+@wp.func
+def surface_shape(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, wo: wp.vec3) -> Surface:
+    s = bare_surface(scene, face, u, v, wo, 1)
+    s.shading = shading_frame(scene, face, u, v, s.uv, wo)
     return s
 
 

@@ -110,7 +110,7 @@ def test_import_is_light_and_compiles_nothing():
 import sys, warp
 before = set(sys.modules)
 import warp_gi
-heavy = {"trimesh", "OpenImageIO", "rich", "tyro", "PIL", "pygltflib", "scipy"}
+heavy = {"trimesh", "OpenImageIO", "OpenEXR", "rich", "tyro", "PIL", "pygltflib", "scipy"}
 print(sorted({name.partition(".")[0] for name in set(sys.modules) - before} & heavy))
 print(sorted(name for name in sys.modules if name.startswith("warp_gi.")))
 print(warp._src.context.runtime is None)

@@ -100,7 +100,10 @@ class Frame:
         self.seed = seed
         """Hash of the sequence's seed and the frame's number."""
         self.timings: dict[str, float] = {}
-        """Wall seconds by stage; "compile" is kernel compilation, left out of the others."""
+        """Wall seconds by stage; "compile" is kernel compilation, left out of the others; "scheduler" is none of these.
+
+        All but "bake", which was before, add up to what the frame took; who writes it adds "write" and "save state".
+        """
         self.metadata: dict[str, str | int | float] = {}
         """Values by name that decide the pixels, beside camera and time."""
         self.paths = PathRequest(data.emitters)
@@ -274,9 +277,22 @@ class Frame:
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Add the wall time of a block to ``timings[name]``, compilation apart."""
-        compiled, started = launch.compile_seconds, time.perf_counter()
-        yield
-        wp.synchronize_device(self.device)
-        compiled = launch.compile_seconds - compiled
-        self.timings["compile"] = self.timings.get("compile", 0.0) + compiled
-        self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - started - compiled
+        with timed(self.timings, name, self.device):
+            yield
+
+
+@contextmanager
+def timed(timings: dict[str, float], name: str, device: wp.Device) -> Iterator[None]:
+    """Add the wall time of a block to ``timings[name]``, and what it compiled to ``timings["compile"]``.
+
+    What blocks within it add is left out, so that all timings add up to the time that passed.
+    """
+    timings.setdefault("compile", 0.0)
+    others, compiled = sum(timings.values()), launch.compile_seconds - timings["compile"]
+    started = time.perf_counter()
+    yield
+    wp.synchronize_device(device)
+    others = sum(timings.values()) - others
+    compiled = launch.compile_seconds - timings["compile"] - compiled
+    timings["compile"] += compiled
+    timings[name] = timings.get(name, 0.0) + time.perf_counter() - started - compiled - others

@@ -12,6 +12,7 @@ and of others. CUDA does not work there once the parent has started it: an error
 
 from __future__ import annotations
 
+import functools
 import itertools
 import os
 import threading
@@ -230,14 +231,28 @@ def _mismatch(expected: Any, value: object, device: wp.Device) -> str | None:
         struct: Any = getattr(value, "_cls", None)
         if struct is not expected:
             return f"expected struct {expected.key}, got {getattr(struct, 'key', type(value).__name__)}"
-        for name, variable in expected.vars.items():
-            problem = _mismatch(variable.type, getattr(value, name), device)
+        for name, kind, dtype in _arrays_of(expected):
+            field = getattr(value, name)
+            if dtype is not None and (field is None or (field.dtype is dtype and field.device is device)):
+                continue  # Warp compares the rank when a field is set
+            problem = _mismatch(kind, field, device)
             if problem:
                 return f"field {name}: {problem}"
         return None
     if isinstance(value, np.ndarray | wp.array):
         return f"expected {expected}, got an array"
     return None
+
+
+@functools.cache
+def _arrays_of(struct: Any) -> tuple[tuple[str, Any, type | None], ...]:
+    """Return name, type and dtype of the fields that are arrays, and of those that are structs, whose dtype is None."""
+    kinds = ((name, variable.type) for name, variable in struct.vars.items())
+    return tuple(
+        (name, kind, kind.dtype if isinstance(kind, wp.array) else None)
+        for name, kind in kinds
+        if isinstance(kind, wp.array) or hasattr(kind, "vars")
+    )
 
 
 def _unlock_loading() -> None:

@@ -20,7 +20,7 @@ from warp_gi.denoise import Denoiser
 from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.forecast import tell_cost
-from warp_gi.frame import Frame
+from warp_gi.frame import Frame, timed
 from warp_gi.kept import BakeFolder, cached_bake
 from warp_gi.kernels import compose, types
 from warp_gi.pipeline import DENOISER, Pipeline
@@ -211,11 +211,17 @@ class FrameScheduler:
 
         A frame that an exception interrupts leaves nothing behind: what is rendered next is as if it had not begun.
         """
-        self.scene.check_unchanged()
+        began, timings = time.perf_counter(), {"bake": 0.0, "compile": 0.0}
+        with timed(timings, "scene", self.device):
+            self.scene.check_unchanged()
+        baking = time.perf_counter()
         self.bake(frame_time(self.camera, index))
+        began += time.perf_counter() - baking
         if previous_index is None:
             previous_index = max(index - 1, 0)
-        frame = self._new_frame(index, previous_index)
+        with timed(timings, "scene", self.device):
+            frame = self._new_frame(index, previous_index)
+        frame.timings = timings
         states, denoiser = dict(self._states), self._parts.get(DENOISER)
         if isinstance(denoiser, Denoiser):
             frame.settings = replace(frame.settings, spp=denoiser.samples(frame, states[DENOISER]))
@@ -238,6 +244,8 @@ class FrameScheduler:
                 states[DENOISER] = denoiser.apply(frame, states[DENOISER])
         self._states = states  # all or nothing
         frame.finish()
+        timings["scheduler"] = max(time.perf_counter() - began - sum(timings.values()), 0.0)
+        timings["bake"] = self._bake_seconds
         return frame
 
     def take_samples(self, spp: int, frame_time: float | None = None) -> None:
@@ -264,7 +272,6 @@ class FrameScheduler:
         return other.frame(index, previous_index)
 
     def _new_frame(self, index: int, previous_index: int) -> Frame:
-        started, compiled = time.perf_counter(), launch.compile_seconds
         now = frame_time(self.camera, index)
         self.scene.update(now, frame_time(self.camera, previous_index), self.device)
         data = launch.copied(self.scene.data(self.device), types.SceneData)
@@ -276,9 +283,6 @@ class FrameScheduler:
         frame = Frame(self.scene, data, *cameras, settings, self.device, index, now, seed, previous_index)
         frame.estimators = dict(self.pipeline.estimators())
         frame.has_camera_rays = isinstance(self.pipeline.primary()[1], CameraRays)
-        compiled = launch.compile_seconds - compiled
-        frame.timings |= {"bake": self._bake_seconds, "compile": compiled}
-        frame.timings["scene"] = time.perf_counter() - started - compiled
         frame.metadata |= self.metadata()
         return frame
 
@@ -289,13 +293,14 @@ class FrameScheduler:
             primary.trace(frame, states.get(owner))
         if primary.is_whole:
             return
-        for place, cache in self.pipeline.radiance_caches():
-            cache.give(frame, states[place])
+        with frame.stage("paths"):
+            for place, cache in self.pipeline.radiance_caches():
+                cache.give(frame, states[place])
         for term, estimator in self.pipeline.estimators():
             with frame.stage(term):
                 estimator.trace(frame, states[term])
-        frame.paths.prepare()
         with frame.stage("paths"):
+            frame.paths.prepare()
             frame.trace_paths()
 
     def _camera_at(self, index: int) -> Camera:

@@ -167,7 +167,8 @@ def fork_in_a_launch():
 
 
 def write_exr_in_the_child():
-    """OpenImageIO keeps threads for EXR files, which a child lacks."""
+    """OpenEXR has threads while it writes, which a child lacks: none stay, and a fork waits until a file is done."""
+    launch.set_threads(2)
     values = {"beauty": np.random.default_rng(1).random((96, 128, 3), np.float32)}
     with tempfile.TemporaryDirectory() as folder:
         path, other = Path(folder) / "parent.exr", Path(folder) / "child.exr"
@@ -175,6 +176,10 @@ def write_exr_in_the_child():
         assert in_fork(lambda: [write_exr(other, values, {}, "float") for _ in range(2)]) == [None, None]
         assert path.read_bytes() == other.read_bytes()
         assert np.array_equal(read_exr(other)[0]["beauty"], values["beauty"])
+        writer = threading.Thread(target=lambda: [write_exr(path, values, {}, "float") for _ in range(20)])
+        writer.start()
+        while writer.is_alive():
+            assert in_fork(lambda: write_exr(other, values, {}, "float")) is None
 
 
 def render_in_other_processes(method):

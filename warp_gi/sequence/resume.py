@@ -237,11 +237,11 @@ class SequenceRun:
 
     def render(self, shot: Shot) -> Frame:
         """Render a frame of the plan's ``todo`` and write its file; the time it took is the frame's timing "write"."""
-        remove_stale_parts(shot.path)
         frame = self.scheduler.frame(shot.index, shot.previous)
         if shot.lineage:
             frame.metadata["lineage"] = shot.lineage
         started = time.perf_counter()
+        remove_stale_parts(shot.path)
         self.output.write(frame, shot.path)
         frame.timings["write"] = time.perf_counter() - started
         return frame
