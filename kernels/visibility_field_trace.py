@@ -287,15 +287,27 @@ def lambert_samples(
         above = (bits >> 16) & lanes
         visible = bits & above
         occluded = (bits >> 8) & above
+        sure = int(0)
+        verified = int(0)
+        todo = int(above)
         if query.mode == MODE_PAPER:
-            todo = int(above)  # a cell without samples traces all
-            if p.slot >= 0:
+            if p.slot >= 0:  # a cell without samples traces all
                 todo = visible
             if subtracts:
                 todo = occluded
                 if (p.slot & SLOT_BOXED) != 0:
                     todo = todo | boxed_lanes(query, p, octet, above & ~occluded)
-            blocked = occluded_lanes(scene, p, octet, todo)
+        else:
+            sure = visible ^ occluded
+            if (p.slot & SLOT_BOXED) != 0 and p.slot >= 0:
+                sure = sure & ~boxed_lanes(query, p, octet, sure & visible)
+            if query.mode == MODE_UNBIASED:
+                verified = verified_lanes(query, p, sure, start)
+            todo = (above & ~sure) | verified
+        blocked = int(0)
+        if todo != 0:
+            blocked = occluded_lanes(scene, p, octet, todo)  # one call, which is inlined: two are not
+        if query.mode == MODE_PAPER:
             if subtracts:
                 gone = blocked | (lanes & ~above)
                 sums = add_lanes(scene, sky, octet, gone, -1.0, normal, sums)
@@ -306,16 +318,6 @@ def lambert_samples(
                 if transfer.shape[0] > 0:
                     t = add_transfer(t, octet, todo & ~blocked, 1.0)
         else:
-            sure = visible ^ occluded
-            if (p.slot & SLOT_BOXED) != 0 and p.slot >= 0:
-                sure = sure & ~boxed_lanes(query, p, octet, sure & visible)
-            verified = int(0)
-            if query.mode == MODE_UNBIASED:
-                verified = verified_lanes(query, p, sure, start)
-            todo = (above & ~sure) | verified
-            blocked = int(0)
-            if todo != 0:
-                blocked = occluded_lanes(scene, p, octet, todo)
             leaked = verified & visible & blocked
             lost = verified & ~visible & ~blocked
             seen = ((sure & visible) & ~leaked) | (todo & ~verified & ~blocked)
@@ -396,18 +398,19 @@ def lit_lanes(
     above = (bits >> 16) & lanes
     visible = bits & above
     occluded = (bits >> 8) & above
+    sure = int(0)
+    verified = int(0)
+    todo = int(above)
     if query.mode == MODE_PAPER:
-        todo = int(above)
         if p.slot >= 0:
             todo = visible
-        return todo & ~occluded_lanes(scene, p, octet, todo)
-    sure = visible ^ occluded
-    if (p.slot & SLOT_BOXED) != 0 and p.slot >= 0:
-        sure = sure & ~boxed_lanes(query, p, octet, sure & visible)
-    verified = int(0)
-    if query.mode == MODE_UNBIASED:
-        verified = verified_lanes(query, p, sure, start)
-    todo = (above & ~sure) | verified
+    else:
+        sure = visible ^ occluded
+        if (p.slot & SLOT_BOXED) != 0 and p.slot >= 0:
+            sure = sure & ~boxed_lanes(query, p, octet, sure & visible)
+        if query.mode == MODE_UNBIASED:
+            verified = verified_lanes(query, p, sure, start)
+        todo = (above & ~sure) | verified
     blocked = int(0)
     if todo != 0:
         blocked = occluded_lanes(scene, p, octet, todo)
