@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import warp as wp
 
+from warp_gi import launch
 from warp_gi.errors import OptionError, check_whole, one_line, unknown_name
 from warp_gi.kernels import denoise, denoise_edges
 from warp_gi.stateful import Ahead, Stateful
@@ -286,15 +287,50 @@ class SpatioTemporal(Denoiser):
 
 
 @dataclass(frozen=True)
-class Oidn(Denoiser):
-    """Intel Open Image Denoise, with albedo and normals as guides; each frame for itself.
+class OidnFilter(SpatioTemporal):
+    """``SpatioTemporal`` with Open Image Denoise in place of its filter over pixels."""
 
-    Runs on the CPU, on threads of its own, whatever the frame's device. ``start`` raises OptionError where it is
-    not installed.
+    library: Any = None
+    quality: str = "fast"
+
+    def _filtered(
+        self,
+        frame: Frame,
+        settings: denoise.DenoiseSettings,
+        guides: denoise.Guides,
+        average: denoise.Signals,
+        more: int,
+    ) -> denoise.Filtered:
+        """Return both averages filtered as pictures, with normals as guides that have no noise."""
+        width, height = frame.camera.resolution
+        normal, known = guides.guide_normal.numpy().reshape(height, width, 3), average.length.numpy() > 0
+        filtered = denoise.Filtered()
+        for lobe, name in enumerate(("diffuse", "glossy")):
+            light = getattr(average, name).numpy().reshape(height, width, 3)
+            white = np.ones_like(light)  # albedo: it takes no normals without
+            clean = self.library.denoise(light, white, normal, hdr=True, clean_aux=True, quality=self.quality)
+            spread = np.where(known[:, lobe], 0.0, -1.0)  # where light is not known, as in denoise.Filtered
+            values = np.concatenate([clean.reshape(-1, 3), spread[:, None]], axis=1).astype(np.float32)
+            setattr(filtered, name, launch.on_device(values, wp.vec4, frame.device))
+        return filtered
+
+
+@dataclass(frozen=True)
+class Oidn(Denoiser):
+    """Intel Open Image Denoise of the average over frames of ``SpatioTemporal``, or of each frame for itself.
+
+    What is filtered of an average is light before it meets the surfaces' colours, diffuse and glossy apart; edges and
+    the average of pictures are those of ``SpatioTemporal``. It runs on the CPU, on threads of its own, whatever
+    the frame's device. ``start`` raises OptionError where it is not installed.
     """
 
-    quality: str = "high"
-    """Quality of Open Image Denoise: "high", "balanced" or "fast"."""
+    wants_lobes: ClassVar[bool] = True
+
+    quality: str = "fast"
+    """Quality of Open Image Denoise: "high", "balanced" or "fast". Of a frame for itself "high" pays."""
+    accumulate: bool = True
+    """Whether it denoises the average over frames. False is each frame for itself, with albedo and normals as guides:
+    it flickers more, and loses light in dark frames of few samples."""
 
     def validate(self) -> None:
         """Raise OptionError for an unknown quality."""
@@ -302,23 +338,26 @@ class Oidn(Denoiser):
             raise unknown_name("quality", self.quality, QUALITIES)
 
     def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
-        """Return False: the state is the library."""
-        return False
+        """Return whether it accumulates; else the state is the library alone."""
+        return self.accumulate
 
     def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> Any:
-        """Return the library; raises OptionError where it is not installed."""
+        """Return the library and no history; raises OptionError where it is not installed."""
         try:
-            return importlib.import_module("pyoidn")
+            return importlib.import_module("pyoidn"), None
         except (ImportError, OSError) as error:
             message = f"Open Image Denoise is not here ({error}); pip install 'warp-gi[denoise]'"
             raise OptionError(one_line(message)) from error
 
     def apply(self, frame: Frame, state: Any) -> Any:
         """Fill ``frame["beauty"]``: emission as it is, and all other light denoised."""
+        library, history = state
+        if self.accumulate:
+            return library, OidnFilter(library=library, quality=self.quality).apply(frame, history)
         emission = frame.numpy("emission")
         noisy = np.maximum(frame.numpy("noisy") - emission, 0.0)
         albedo = np.clip(frame.numpy("albedo"), 0.0, 1.0)
-        light = state.denoise(noisy, albedo, frame.numpy("normal"), hdr=True, quality=self.quality)
+        light = library.denoise(noisy, albedo, frame.numpy("normal"), hdr=True, quality=self.quality)
         frame["beauty"].assign((emission + light).reshape(-1, 3))
         return state
 
