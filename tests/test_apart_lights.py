@@ -217,7 +217,7 @@ def test_shadows_are_not_filtered_over_pixels():
     sun = gi.PunctualLight("directional", (3.0, 3.0, 3.0), direction=(0.2, -1.0, 0.6))
     errors = {}
     for frames in (0, 4):
-        settings = SpatioTemporal(edge_samples=0, apart_frames=frames)
+        settings = SpatioTemporal(edge_samples=0, blend=1.0, apart_frames=frames)
         one = gi.Pipeline(spp=1, indirect=None, denoise=settings)
         scheduler = gi.FrameScheduler(shadow(lights=[sun]), path(0.013), one)
         found = [scheduler.frame(index) for index in range(4)]
@@ -233,7 +233,7 @@ def test_shadows_of_a_sun_are_sharp_and_right():
     wanted = reference.numpy("beauty")
     errors, means = {}, {}
     for frames in (0, 4):
-        settings = SpatioTemporal(edge_samples=0, apart_frames=frames)
+        settings = SpatioTemporal(edge_samples=0, blend=1.0, apart_frames=frames)
         one = gi.Pipeline(spp=1, camera_samples=1, indirect=None, denoise=settings)
         scheduler = gi.FrameScheduler(shadow(sunny_sky()), path(0.013), one)
         for index in range(8):

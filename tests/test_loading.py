@@ -171,10 +171,12 @@ def test_one_line_says_what_is_compiled_for_the_first_time(monkeypatch, tmp_path
         launch.load(one, CPU)
 
 
+@pytest.mark.parametrize("sky", [None, gi.SunSky(elevation=30.0)], ids=["no sky", "sun"])
 @pytest.mark.parametrize("preset", ["path", "clean", "reuse"])
-def test_the_kernels_that_a_pipeline_foretells_are_those_that_its_frames_launch(monkeypatch, preset):
+def test_the_kernels_that_a_pipeline_foretells_are_those_that_its_frames_launch(monkeypatch, preset, sky):
     """Add what is missing to ``kernels`` or ``samplers`` of the part that launches it; take out what no frame does."""
     scene = gi.builtin_scene("cornell_box")
+    scene.environment = sky
     scene.lights = [gi.PunctualLight("point", (0.3, 1.5, 0.2)), gi.PunctualLight("point", (-0.3, 1.5, 0.2))]
     pipeline = gi.Pipeline.preset(preset)
     loaded = set()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -13,13 +13,13 @@ import warp as wp
 
 from warp_gi import launch
 from warp_gi.errors import OptionError, check_whole, one_line, unknown_name
-from warp_gi.kernels import denoise, denoise_apart, denoise_edges
+from warp_gi.kernels import apart_lights, denoise, denoise_apart, denoise_edges
+from warp_gi.scene.apart import ApartLights, has_apart_lights
 from warp_gi.stateful import Ahead, Stateful
 
 if TYPE_CHECKING:
     from warp_gi.baking import Bake
     from warp_gi.frame import Frame
-    from warp_gi.scene.apart import ApartLights
     from warp_gi.scene.baked import BakedScene
     from warp_gi.scene.scene import Scene
 
@@ -150,8 +150,8 @@ READ_GUIDES = ("guide_object", "guide_normal", "guide_position")
 def _empty(struct: type[launch.Struct], device: wp.Device) -> launch.Struct:
     """Return a kernel struct whose arrays have no items."""
     empty = struct()
-    for name, field in struct.vars.items():  # type: ignore[attr-defined]
-        setattr(empty, name, wp.empty(0, dtype=field.type.dtype, device=device))
+    for name, variable in struct.vars.items():  # type: ignore[attr-defined]
+        setattr(empty, name, wp.empty(0, dtype=variable.type.dtype, device=device))
     return empty
 
 
@@ -245,9 +245,17 @@ class SpatioTemporal(Denoiser):
         return True
 
     def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
-        """Return the kernels of the filter, and of edges."""
+        """Return the kernels of the filter, of edges, and of light that is apart."""
         edges = (denoise_edges.sample_edges,) if self.edge_samples or self.blend < 1 else ()
-        return (denoise.separate_light, *edges)
+        apart = (denoise_apart.average_apart,) if self.samplers(scene) else ()
+        return (denoise.separate_light, *edges, *apart)
+
+    def samplers(self, scene: Scene | BakedScene | None = None) -> tuple[Any, ...] | None:
+        """Return the lights that paths keep apart, if the scene has any."""
+        if scene is None and self.parts_lights:
+            return None
+        is_parted = scene is not None and self.parts_lights and has_apart_lights(scene)
+        return (apart_lights.APART_LIGHTS,) if is_parted else ()
 
     def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> History:
         """Return a history of no frame."""
@@ -421,15 +429,61 @@ class SpatioTemporal(Denoiser):
 
 
 @dataclass(frozen=True)
-class Oidn(Denoiser):
-    """Intel Open Image Denoise, with albedo and normals as guides; each frame for itself.
+class OidnFilter(SpatioTemporal):
+    """``SpatioTemporal`` with Open Image Denoise in place of its filter over pixels."""
 
-    Runs on the CPU, on threads of its own, whatever the frame's device. ``start`` raises OptionError where it is
-    not installed.
+    apart_frames: int = 0
+    library: Any = None
+    quality: str = "fast"
+
+    def _filtered(
+        self,
+        frame: Frame,
+        settings: denoise.DenoiseSettings,
+        guides: denoise.Guides,
+        average: denoise.Signals,
+        more: int,
+    ) -> denoise.Filtered:
+        """Return both averages filtered as pictures, with normals as guides that have no noise."""
+        width, height = frame.camera.resolution
+        normal, known = guides.guide_normal.numpy().reshape(height, width, 3), average.length.numpy() > 0
+        filtered = denoise.Filtered()
+        for lobe, name in enumerate(("diffuse", "glossy")):
+            light = getattr(average, name).numpy().reshape(height, width, 3)
+            white = np.ones_like(light)  # albedo: it takes no normals without
+            clean = self.library.denoise(light, white, normal, hdr=True, clean_aux=True, quality=self.quality)
+            spread = np.where(known[:, lobe], 0.0, -1.0)  # where light is not known, as in denoise.Filtered
+            values = np.concatenate([clean.reshape(-1, 3), spread[:, None]], axis=1).astype(np.float32)
+            setattr(filtered, name, launch.on_device(values, wp.vec4, frame.device))
+        return filtered
+
+
+@dataclass(frozen=True)
+class OidnState:
+    """State of ``Oidn``."""
+
+    library: Any = field(metadata={"derived": True})
+    """The module of Open Image Denoise."""
+    history: History
+    """What it keeps of the last frame, if it accumulates."""
+
+
+@dataclass(frozen=True)
+class Oidn(Denoiser):
+    """Intel Open Image Denoise of the average over frames of ``SpatioTemporal``, or of each frame for itself.
+
+    What is filtered of an average is light before it meets the surfaces' colours, diffuse and glossy apart; edges and
+    the average of pictures are those of ``SpatioTemporal``. It runs on the CPU, on threads of its own, whatever
+    the frame's device. ``start`` raises OptionError where it is not installed.
     """
 
-    quality: str = "high"
-    """Quality of Open Image Denoise: "high", "balanced" or "fast"."""
+    wants_lobes: ClassVar[bool] = True
+
+    quality: str = "fast"
+    """Quality of Open Image Denoise: "high", "balanced" or "fast". Of a frame for itself "high" pays."""
+    accumulate: bool = True
+    """Whether it denoises the average over frames. False is each frame for itself, with albedo and normals as guides:
+    it flickers more, and loses light in dark frames of few samples."""
 
     def validate(self) -> None:
         """Raise OptionError for an unknown quality."""
@@ -437,23 +491,35 @@ class Oidn(Denoiser):
             raise unknown_name("quality", self.quality, QUALITIES)
 
     def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
-        """Return False: the state is the library."""
-        return False
+        """Return whether it accumulates; else the state is the library alone."""
+        return self.accumulate
 
-    def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> Any:
-        """Return the library; raises OptionError where it is not installed."""
+    @property
+    def saves_state(self) -> bool:
+        """True: a file holds the average."""
+        return True
+
+    def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
+        """Return the kernels of the average and of edges."""
+        return OidnFilter().kernels(scene) if self.accumulate else ()
+
+    def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> OidnState:
+        """Return the library and a history of no frame; raises OptionError where it is not installed."""
         try:
-            return importlib.import_module("pyoidn")
+            return OidnState(importlib.import_module("pyoidn"), History.empty(scene, wp.get_device(device)))
         except (ImportError, OSError) as error:
             message = f"Open Image Denoise is not here ({error}); pip install 'warp-gi[denoise]'"
             raise OptionError(one_line(message)) from error
 
-    def apply(self, frame: Frame, state: Any) -> Any:
+    def apply(self, frame: Frame, state: OidnState) -> OidnState:
         """Fill ``frame["beauty"]``: emission as it is, and all other light denoised."""
+        if self.accumulate:
+            accumulating = OidnFilter(library=state.library, quality=self.quality)
+            return replace(state, history=accumulating.apply(frame, state.history))
         emission = frame.numpy("emission")
         noisy = np.maximum(frame.numpy("noisy") - emission, 0.0)
         albedo = np.clip(frame.numpy("albedo"), 0.0, 1.0)
-        light = state.denoise(noisy, albedo, frame.numpy("normal"), hdr=True, quality=self.quality)
+        light = state.library.denoise(noisy, albedo, frame.numpy("normal"), hdr=True, quality=self.quality)
         frame["beauty"].assign((emission + light).reshape(-1, 3))
         return state
 

@@ -28,20 +28,23 @@ def kernels_of(pipeline: Pipeline, scene: Scene | BakedScene | None = None) -> l
     for part in (*parts.values(), primary):
         found += part.kernels(scene)
     if not primary.is_whole:
-        found += [_tracer(pipeline, scene), compose.compose_frame]
+        found += [*_tracer(pipeline, scene), compose.compose_frame]
     for part in last.values():
         found += part.kernels(scene)
     return found
 
 
-def _tracer(pipeline: Pipeline, scene: Scene | BakedScene | None) -> wp.Kernel:
-    """Return the kernel of the path tracer with the samplers that the pipeline's parts name."""
-    named = {type(one): one for part in pipeline.parts().values() for one in part.samplers(scene)}
-    caches = [one for _, part in pipeline.radiance_caches() for one in part.samplers(scene)]
+def _tracer(pipeline: Pipeline, scene: Scene | BakedScene | None) -> list[wp.Kernel]:
+    """Return the kernel of the path tracer with the samplers that the parts name; none where that needs the scene."""
+    given = [part.samplers(scene) for part in pipeline.parts().values()]
+    if any(one is None for one in given):
+        return []
+    named = {type(one): one for samplers in given for one in samplers or ()}
+    caches = [one for _, part in pipeline.radiance_caches() for one in part.samplers(scene) or ()]
     lights = named.get(path_samplers.LightSampler, path_samplers.ALIAS_LIGHTS)
     directions = named.get(path_samplers.DirectionSampler, path_samplers.BSDF_DIRECTIONS)
     uses_regions = lights.uses_regions or directions.uses_regions
     regions = named.get(path_samplers.Regions) if uses_regions else None
     cache = next((one for one in caches if isinstance(one, path_samplers.PathCache)), path_samplers.NO_CACHE)
     sky = named.get(path_samplers.Sky, path_samplers.SCENE_SKY)
-    return path_tracer(lights, directions, regions or path_samplers.NO_REGIONS, sky, cache).trace_paths
+    return [path_tracer(lights, directions, regions or path_samplers.NO_REGIONS, sky, cache).trace_paths]

@@ -87,8 +87,11 @@ class Stateful:
         """
         return ()
 
-    def samplers(self, scene: Scene | BakedScene | None = None) -> tuple[Any, ...]:
-        """Return the samplers of ``kernels.path_samplers`` that this will give to paths, as they are compiled in."""
+    def samplers(self, scene: Scene | BakedScene | None = None) -> tuple[Any, ...] | None:
+        """Return the samplers of ``kernels.path_samplers`` that this will give to paths, as they are compiled in.
+
+        None says that they depend on the scene, where that is not known yet.
+        """
         return ()
 
     # ---- before the first frame ----

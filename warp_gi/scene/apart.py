@@ -32,6 +32,16 @@ class ApartLights:
     """Half-angles of even discs as wide as the suns, radians, float64 [suns]."""
 
 
+def has_apart_lights(scene: Scene | BakedScene) -> bool:
+    """Return whether a scene has lights that would be apart; no tables are made."""
+    return _light_count(scene) > 0 or (scene.environment is not None and scene.environment.has_small_suns)
+
+
+def _light_count(scene: Scene | BakedScene) -> int:
+    is_few = not isinstance(scene, BakedScene) and scene.emitter_count == len(scene.lights) <= MOST_LIGHTS
+    return len(scene.lights) if is_few and not isinstance(scene, BakedScene) else 0
+
+
 def apart_lights_of(
     scene: Scene | BakedScene, device: wp.Device, of_sky: bool = True, of_emitters: bool = True
 ) -> ApartLights | None:
@@ -48,8 +58,8 @@ def apart_lights_of(
         data.suns, data.nodes, data.sums = tables.suns, tables.nodes, tables.sums
         directions = tables.parts.directions @ rest.world_from_environment.T
         widths = np.arccos(tables.parts.cos_discs)
-    if of_emitters and not isinstance(scene, BakedScene) and scene.emitter_count == len(scene.lights) <= MOST_LIGHTS:
-        data.light_count = len(scene.lights)
+    if of_emitters:
+        data.light_count = _light_count(scene)
     if data.sun_count + data.light_count == 0:
         return None
     return ApartLights(data, directions, widths)

@@ -151,6 +151,11 @@ class Environment:
         irradiances = parts.irradiances * self.scale
         return SunSplit(sky, directions, irradiances, parts.cos_cones, parts.cos_discs, parts.share)
 
+    @property
+    def has_small_suns(self) -> bool:
+        """Whether there are suns that are worth a ray of their own."""
+        return self._map is not None and not self.is_black and bool(self._map.small_suns()[0].nodes)
+
     def small_suns(self, device: wp.Device) -> tuple[SunTables, Environment] | None:
         """Return the suns that are worth a ray of their own, and the sky without them; None if there are none.
 

@@ -92,9 +92,13 @@ class SkyMap:
 
         return self.once(("split", brighter_than, most, least_share, widest), make)
 
+    def small_suns(self) -> tuple[MapSplit, SkyMap]:
+        """Return the suns that are worth a ray, and the map without them."""
+        return self.split(SUN_BRIGHTER_THAN, MOST_RAYS, LEAST_SHARE, WIDEST)
+
     def sun_tables(self, device: wp.Device) -> SunTables | None:
         """Return the suns that are worth a ray, made once a device; None if there are none."""
-        parts, rest = self.split(SUN_BRIGHTER_THAN, MOST_RAYS, LEAST_SHARE, WIDEST)
+        parts, rest = self.small_suns()
         if not parts.nodes:
             return None
         return self.once(("sun tables", device.alias), lambda pixels: _sun_tables(pixels, parts, rest, device))

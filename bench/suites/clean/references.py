@@ -155,7 +155,7 @@ def cleaner(scene: gi.Scene, camera: gi.Camera, moment: int, device: str) -> Cal
     It gets light without emission, as with bright lamps in it light would be lost. Pixels of lamps stay as they are.
     """
     try:
-        library = gi.Oidn().start(scene, device)
+        library = gi.Oidn().start(scene, device).library
     except OptionError:
         return None
     pipeline = _no_light(GUIDE_SPP)
