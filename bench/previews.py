@@ -38,19 +38,25 @@ class ReadmePicture:
     spp: int
     frame: int = 0
     columns: int = 1
+    pipeline: str = "path"
+    """Preset that renders it; one that depends on frames before renders those, too."""
 
 
 README_PICTURES = {
-    "assets/atrium.jpg": ReadmePicture(("atrium",), (960, 540), 64, frame=20),
+    "assets/atrium.jpg": ReadmePicture(("atrium",), (960, 540), 1, frame=23, pipeline="clean"),
     "assets/places.jpg": ReadmePicture(("street", "warehouse", "two_rooms", "sphere_row"), (240, 135), 256, columns=4),
 }
 """Pictures by file."""
 
 
-def render(name: str, size: tuple[int, int], spp: int, frame: int = 0, device: str = "cpu") -> np.ndarray:
+def render(
+    name: str, size: tuple[int, int], spp: int, frame: int = 0, device: str = "cpu", preset: str = "path"
+) -> np.ndarray:
     """Return a frame of a place, tone-mapped as `warp-gi render` does: uint8 [height, width, 3]."""
-    place, pipeline = PLACES[name], gi.Pipeline.preset("path", spp=spp)
+    place, pipeline = PLACES[name], gi.Pipeline.preset(preset, spp=spp)
     scheduler = gi.FrameScheduler(place.scene(), place.path().at_resolution(*size), pipeline, device)
+    for before in range(frame if scheduler.dependence().on_past else 0):
+        scheduler.frame(before)
     return tone_map(stored_values("beauty", scheduler.frame(frame).numpy("beauty")))
 
 
@@ -86,7 +92,8 @@ def write_readme_pictures(root: Path, spp: int | None = None, device: str = "cpu
 
 def tiled(picture: ReadmePicture, device: str = "cpu") -> np.ndarray:
     """Return the places of a picture in rows of ``columns``, uint8 [height, width, 3]."""
-    tiles = [render(name, picture.size, picture.spp, picture.frame, device) for name in picture.places]
+    shown = (picture.size, picture.spp, picture.frame, device, picture.pipeline)
+    tiles = [render(name, *shown) for name in picture.places]
     rows = [np.hstack(tiles[first : first + picture.columns]) for first in range(0, len(tiles), picture.columns)]
     return np.vstack(rows)
 

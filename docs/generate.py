@@ -4,7 +4,8 @@
 
 - ``settings: VisibilityField`` is a table of a dataclass's fields, with the docstrings below them;
 - ``flags: warp_gi.cli.render.Render`` is the same as flags of a command;
-- ``names: Scene Mesh`` is a table of names with the first line of their docstrings.
+- ``names: Scene Mesh`` is a table of names with the first line of their docstrings;
+- ``features: warp_gi.scene.files.support.FEATURES`` is a table of what scene files can hold.
 
 ``--check`` writes nothing, and leaves with exit code 1 if a page is not what it would write.
 """
@@ -27,7 +28,7 @@ import warp_gi
 
 DOCS = Path(__file__).parent
 REGION = re.compile(
-    r"(<!-- (?P<kind>settings|flags|names): (?P<what>[\w. ]+) -->\n).*?(?P<end><!-- end -->)", re.DOTALL
+    r"(<!-- (?P<kind>settings|flags|names|features): (?P<what>[\w. ]+) -->\n).*?(?P<end><!-- end -->)", re.DOTALL
 )
 
 
@@ -100,7 +101,18 @@ def names_table(names: str) -> str:
     return _table(("name", "what it is"), rows)
 
 
-KINDS: dict[str, Callable[[str], str]] = {"settings": settings_table, "flags": flags_table, "names": names_table}
+def features_table(name: str) -> str:
+    """Return what scene files can hold, and what becomes of it, as a Markdown table."""
+    rows = [(one.name, one.formats, one.status, one.how) for one in named(name)]
+    return _table(("feature", "formats", "status", "what becomes of it"), rows)
+
+
+KINDS: dict[str, Callable[[str], str]] = {
+    "settings": settings_table,
+    "flags": flags_table,
+    "names": names_table,
+    "features": features_table,
+}
 
 
 def filled(text: str) -> str:

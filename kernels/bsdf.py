@@ -43,15 +43,22 @@ class BsdfSample:
     pdf: wp.float32
 
 
+# `reflectance` is that of the coat at normal incidence, before the factor `specular`.
 @wp.func
-def make_bsdf(base: wp.vec3, metallic: wp.float32, roughness: wp.float32, specular: wp.float32) -> Bsdf:
+def make_coated_bsdf(
+    base: wp.vec3, metallic: wp.float32, roughness: wp.float32, specular: wp.float32, reflectance: wp.vec3
+) -> Bsdf:
     b = Bsdf()
     b.diffuse = base * (1.0 - metallic)
-    dielectric = 0.04 * specular * (1.0 - metallic)
-    b.f0 = wp.vec3(dielectric, dielectric, dielectric) + base * metallic
+    b.f0 = reflectance * specular * (1.0 - metallic) + base * metallic
     b.f90 = specular * (1.0 - metallic) + metallic
     b.alpha = wp.max(roughness * roughness, SMALLEST_ALPHA)
     return b
+
+
+@wp.func
+def make_bsdf(base: wp.vec3, metallic: wp.float32, roughness: wp.float32, specular: wp.float32) -> Bsdf:
+    return make_coated_bsdf(base, metallic, roughness, specular, wp.vec3(0.04, 0.04, 0.04))
 
 
 @wp.func

@@ -32,6 +32,7 @@ def runs_on_cuda() -> wp.int32: ...
     const auto* masks = bvh.masks.data;
     const auto* indices = bvh.indices.data;
     const auto* uvs = bvh.uvs.data;
+    const auto* alphas = bvh.alphas.data;
     const auto* textures = bvh.textures.data;
     const auto* texels = bvh.texels.data;
     """

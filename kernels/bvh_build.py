@@ -16,7 +16,7 @@ import warp as wp
 from warp_gi.kernels.bvh_build_native import BLOCK_COST, BUILD_SUBTREE, FILL_NODES, NODE_COST, SPLIT_TOP, WIDEN
 from warp_gi.kernels.bvh_native import BLOCK_WORDS, FACE_MASKED, FACE_WORD, LANES, NODE_WORDS, cpu_only
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})  # unrolled, it compiles for 1.2 s longer
 
 BOX_WORDS = 8  # of the scratch in which bounds travel upwards
 

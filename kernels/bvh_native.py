@@ -39,10 +39,11 @@ def cpu_only(snippet: str, otherwise: str = "", **constants: float) -> str:
 # Whether the alpha of `face` at barycentrics u, v is below the cutoff of its mask. Needs the arrays of Bvh in scope.
 TRANSPARENT = """
     const auto& mask = masks[face_masks[face]];
+    const wp::vec3i corner = indices[face];
     float alpha = mask.factor;
+    if (alphas) alpha *= (1.0f - u - v) * alphas[corner[0]] + u * alphas[corner[1]] + v * alphas[corner[2]];
     if (mask.texture >= 0) {
         const auto& texture = textures[mask.texture];
-        const wp::vec3i corner = indices[face];
         const wp::vec2 uv0 = uvs[corner[0]], uv1 = uvs[corner[1]], uv2 = uvs[corner[2]];
         int texel[2][2];  // axis, lower and upper neighbour
         float fraction[2];
@@ -54,6 +55,7 @@ TRANSPARENT = """
             else if (wrap == 1) at = at < 0.0f ? 0.0f : (at > 1.0f ? 1.0f : at);
             else at -= 2.0f * wp::floor(0.5f * at);
             at = at * (float)count - 0.5f;
+            if (texture.nearest) at = wp::floor(at + 0.5f);
             const float low = wp::floor(at);
             fraction[axis] = at - low;
             for (int side = 0; side < 2; ++side) {
@@ -181,6 +183,7 @@ TRAVERSAL = (
         decltype(bvh.masks.data) masks;
         decltype(bvh.indices.data) indices;
         decltype(bvh.uvs.data) uvs;
+        decltype(bvh.alphas.data) alphas;
         decltype(bvh.textures.data) textures;
         decltype(bvh.texels.data) texels;
 
@@ -201,7 +204,7 @@ TRAVERSAL = (
 QUERY = """
     const Query query = {
         (const char*)bvh.nodes.data, (const char*)bvh.blocks.data, bvh.face_masks.data, bvh.masks.data,
-        bvh.indices.data, bvh.uvs.data, bvh.textures.data, bvh.texels.data
+        bvh.indices.data, bvh.uvs.data, bvh.alphas.data, bvh.textures.data, bvh.texels.data
     };
     return query.run(origin[0], origin[1], origin[2], direction[0], direction[1], direction[2], t_max%s);
 """

@@ -27,6 +27,7 @@ class FrameSums:
     guide_specular: wp.array(dtype=wp.vec3)
     lobe_diffuse: wp.array(dtype=wp.vec3)  # what estimators handed over apart, or empty
     lobe_glossy: wp.array(dtype=wp.vec3)
+    lobe_apart: wp.array(dtype=wp.vec3)
     beauty: wp.array(dtype=wp.vec3)
     variance: wp.array(dtype=wp.vec3)  # of the mean
 
@@ -64,6 +65,8 @@ def compose_frame(first: wp.int32, camera_samples: wp.int32, samples: wp.int32, 
     if b.lobe_diffuse.shape[0] > 0:
         b.lobe_diffuse[i] = b.lobe_diffuse[i] / n
         b.lobe_glossy[i] = b.lobe_glossy[i] / n
+    if b.lobe_apart.shape[0] > 0:
+        b.lobe_apart[i] = b.lobe_apart[i] / n
     b.beauty[i] = emission + environment + emitters + indirect
     if samples > 1:
         b.variance[i] = variance_of_mean(b.moment1[i], b.moment2[i], n)

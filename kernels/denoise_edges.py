@@ -1,39 +1,70 @@
 """Edges of a denoised picture: more camera samples where neighbouring pixels differ, and an average of pictures.
 
-A camera sample has colours, emission and geometry of its own, and shares the filtered light of the pixels around it. So
-it costs a ray and no light. The average over frames (temporal antialiasing) takes the last picture along the motion,
-limited to what the pixels around show now (Karis 2014, "High Quality Temporal Supersampling"), in linear values: in
-squashed ones bright light would be lost.
+A camera sample has colours, emission and geometry of its own, and shares the filtered light of its pixel where it shows
+the same surface, else that of the pixels around. So it costs a ray and no light. The average over frames (temporal
+antialiasing) takes the last picture along the motion, limited to what the pixels around show now (Karis 2014, "High
+Quality Temporal Supersampling"), in linear values: in squashed ones bright light would be lost. What shines by itself,
+lamps and the sky, stays out of it: it has no noise, and a lamp narrower than a pixel, hundreds of times as bright as
+the wall beside it, would light that wall up as the last picture moves by fractions of a pixel.
 """
 
 import warp as wp
 
 from warp_gi.kernels.bsdf import average_specular
 from warp_gi.kernels.bvh import bvh_intersect
-from warp_gi.kernels.denoise import DenoiseSettings, Filtered, Guides, glossy_scale
+from warp_gi.kernels.denoise import (
+    LEAST_REFLECTANCE,
+    Changes,
+    DenoiseSettings,
+    Filtered,
+    Guides,
+    change_at,
+    glossy_scale,
+)
 from warp_gi.kernels.environment import environment_radiance
 from warp_gi.kernels.gbuffer import CameraData, camera_ray, tiled_pixel
-from warp_gi.kernels.sampling import CAMERA_DIMENSION, filter_offset, hash_uint, sample_2d
+from warp_gi.kernels.sampling import CAMERA_DIMENSION, circle, filter_offset, hash_uint, sample_1d, sample_2d
 from warp_gi.kernels.surface import Surface, shading_normal, surface_at, surface_emission
 from warp_gi.kernels.types import SceneData
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 4})  # compiles in less than two thirds, and is as fast
 
 LEAST_COSINE = wp.constant(wp.float32(0.9))  # between normals of pixels that do not differ
+LEAST_CONTRAST = wp.constant(wp.float32(0.05))  # squared, between colours that differ
 MOST_FOOTPRINTS = wp.constant(wp.float32(2.0))  # between a pixel's plane and a point of one that does not differ
 BASE_WEIGHT = wp.constant(wp.float32(0.02))  # of a neighbour's light where a tent is 0
 NORMAL_WEIGHT = wp.constant(wp.float32(16.0))  # of 1 - the cosine between normals, in the exponent
 LEAST_LIGHT = wp.constant(wp.float32(1.0e-4))  # weight of all neighbours below which the likeliest one counts alone
+MOST_ON_RING = wp.constant(4)  # further camera samples that lie on a circle around a pixel's middle
+LESS_HISTORY = wp.constant(
+    wp.float32(0.45)
+)  # of the last picture's weight, where a pixel shows one surface among others
 SMALLEST_DISTANCE = wp.constant(wp.float32(1.0e-9))  # metres
 
 
 @wp.struct
 class EdgeSettings:
     samples: wp.int32  # camera samples of a pixel
+    own: wp.int32  # those of them that it has already, through its middle: 0 or 1
     seed: wp.uint32
     tent: wp.int32  # pixel filter, 1: tent, 0: box
     weight: wp.float32  # of a new picture in the average
     clip: wp.float32  # standard deviations of the pixels around, to which the last picture is limited
+
+
+# Pictures, [height * width]. Beauty is the light that surfaces reflect plus what shines by itself.
+@wp.struct
+class Picture:
+    beauty: wp.array(dtype=wp.vec3)
+    shining: wp.array(dtype=wp.vec3)  # emission, and the sky
+    less: wp.array(dtype=wp.float32)  # share by which the last picture counts less
+
+
+# What the primary saw at pixels' first camera samples, [height * width]: buffers of a frame.
+@wp.struct
+class Seen:
+    depth: wp.array(dtype=wp.float32)
+    motion: wp.array(dtype=wp.vec2)
 
 
 # Filtered light at a point.
@@ -44,34 +75,49 @@ class SharedLight:
     seen: wp.bool  # whether a pixel around sees a surface
 
 
-# Whether pixel j shows something else than pixel i: another surface, or another colour.
+# Whether two colours differ: by a fifth in one channel, for bright ones.
 @wp.func
-def differs(settings: DenoiseSettings, guides: Guides, i: wp.int32, j: wp.int32) -> wp.bool:
+def colors_differ(a: wp.vec3, b: wp.vec3) -> wp.bool:
+    return wp.length_sq(a - b) > LEAST_CONTRAST * (0.05 + wp.dot(a, b))
+
+
+# Whether a point of an object, with a shading normal, is elsewhere than on the surface of pixel i.
+@wp.func
+def is_elsewhere(
+    settings: DenoiseSettings, guides: Guides, i: wp.int32, object: wp.int32, position: wp.vec3, normal: wp.vec3
+) -> wp.bool:
+    if guides.guide_object[i] != object or wp.dot(guides.guide_normal[i], normal) < LEAST_COSINE:
+        return True
+    away = wp.dot(guides.guide_plane[i], position - guides.guide_position[i])
+    return wp.abs(away) > MOST_FOOTPRINTS * settings.footprint * guides.guide_distance[i]
+
+
+# What pixel j shows other than pixel i: 0 nothing, 1 another colour of its surface, 2 another surface.
+@wp.func
+def difference(settings: DenoiseSettings, guides: Guides, i: wp.int32, j: wp.int32) -> wp.int32:
     if guides.guide_object[i] != guides.guide_object[j]:
-        return True
+        return 2
     if guides.guide_object[i] == 0:
-        return False
-    if wp.dot(guides.guide_normal[i], guides.guide_normal[j]) < LEAST_COSINE:
-        return True
-    away = wp.dot(guides.guide_plane[i], guides.guide_position[j] - guides.guide_position[i])
-    if wp.abs(away) > MOST_FOOTPRINTS * settings.footprint * guides.guide_distance[i]:
-        return True
+        return 0
+    if is_elsewhere(settings, guides, i, guides.guide_object[j], guides.guide_position[j], guides.guide_normal[j]):
+        return 2
     a = guides.guide_diffuse[i] + guides.guide_specular[i]
-    b = guides.guide_diffuse[j] + guides.guide_specular[j]
-    return wp.length_sq(a - b) > 0.01 * (0.05 + wp.dot(a, b))
+    if colors_differ(a, guides.guide_diffuse[j] + guides.guide_specular[j]):
+        return 1
+    return 0
 
 
-# Whether the picture needs more camera samples in pixel (x, y).
+# The most that the pixels around pixel (x, y) show other than that one.
 @wp.func
-def is_edge(settings: DenoiseSettings, guides: Guides, x: wp.int32, y: wp.int32) -> wp.bool:
+def edge_of(settings: DenoiseSettings, guides: Guides, x: wp.int32, y: wp.int32) -> wp.int32:
     i = y * settings.width + x
+    most = int(0)
     for k in range(9):
         tx = x + k % 3 - 1
         ty = y + k / 3 - 1
-        if tx >= 0 and tx < settings.width and ty >= 0 and ty < settings.height:
-            if differs(settings, guides, i, ty * settings.width + tx):
-                return True
-    return False
+        if most < 2 and tx >= 0 and tx < settings.width and ty >= 0 and ty < settings.height:
+            most = wp.max(most, difference(settings, guides, i, ty * settings.width + tx))
+    return most
 
 
 @wp.func
@@ -137,7 +183,81 @@ def shared_light(
     return r
 
 
-# Thread: a pixel, in tiles. Where neighbours differ its colour becomes the mean of several camera samples.
+# Light of pixel i at a surface that it shows, of these reflectances; not seen where the pixel does not know it.
+@wp.func
+def own_light(light: Filtered, i: wp.int32, diffuse: wp.vec3, specular: wp.vec3) -> SharedLight:
+    d = light.diffuse[i]
+    g = light.glossy[i]
+    r = SharedLight()
+    r.diffuse = color(d)
+    r.glossy = color(g)
+    known = d[3] >= 0.0 or wp.max(diffuse) <= LEAST_REFLECTANCE
+    r.seen = known and (g[3] >= 0.0 or wp.max(specular) <= LEAST_REFLECTANCE)
+    return r
+
+
+# Offset in pixels from the middle of further camera sample k of `more`. Few lie evenly on a circle, turned at random:
+# with the pixel's own in the middle they show a ramp as it is. Its radius gives all the variance of the pixel filter.
+@wp.func
+def sample_offset(edges: EdgeSettings, more: wp.int32, k: wp.int32, seed: wp.uint32) -> wp.vec2:
+    if more > MOST_ON_RING or edges.own == 0:
+        u = sample_2d(wp.uint32(k), seed, CAMERA_DIMENSION)
+        return wp.vec2(filter_offset(edges.tent, u[0]), filter_offset(edges.tent, u[1]))
+    turn = sample_1d(wp.uint32(0), seed, CAMERA_DIMENSION) + wp.float32(k) / wp.float32(more)
+    variance = wp.where(edges.tent != 0, 1.0 / 6.0, 1.0 / 12.0)
+    all = wp.float32(more + edges.own) / wp.float32(more)
+    return circle(turn - wp.floor(turn)) * wp.sqrt(2.0 * variance * all)
+
+
+# Sums over camera samples of a pixel.
+@wp.struct
+class EdgeSums:
+    reflected: wp.vec3
+    shining: wp.vec3
+    count: wp.float32
+    differ: wp.bool  # whether one of them shows something else than the pixel did
+
+
+# The sums with the camera sample in them that goes through picture coordinates (px, py).
+@wp.func
+def with_sample(
+    scene: SceneData,
+    camera: CameraData,
+    settings: DenoiseSettings,
+    guides: Guides,
+    light: Filtered,
+    pixel: wp.int32,
+    at: wp.vec2,
+    sums: EdgeSums,
+) -> EdgeSums:
+    r = sums
+    direction = camera_ray(camera, at[0], at[1])
+    hit = bvh_intersect(scene.bvh, camera.position, direction, float(wp.inf))
+    if hit.face < 0:
+        r.differ = r.differ or guides.guide_object[pixel] != 0
+        r.shining += environment_radiance(scene.environment, direction)
+        r.count += 1.0
+        return r
+    s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
+    specular = average_specular(s.bsdf)
+    object = scene.geometry.objects[hit.face] + 1
+    elsewhere = is_elsewhere(settings, guides, pixel, object, s.position, shading_normal(s))
+    own_color = guides.guide_diffuse[pixel] + guides.guide_specular[pixel]
+    r.differ = r.differ or elsewhere or colors_differ(own_color, s.bsdf.diffuse + specular)
+    known = SharedLight()
+    if not elsewhere:
+        known = own_light(light, pixel, s.bsdf.diffuse, specular)
+    if not known.seen:
+        known = shared_light(settings, guides, light, s, hit.t, at[0], at[1])
+    if known.seen:
+        r.reflected += wp.cw_mul(s.bsdf.diffuse, known.diffuse) + wp.cw_mul(glossy_scale(specular), known.glossy)
+        r.shining += surface_emission(scene, hit.face, hit.u, hit.v, -direction)
+        r.count += 1.0
+    return r
+
+
+# Thread: a pixel, in tiles. Where neighbours differ its colour becomes the mean of several camera samples. One of them
+# may be its own.
 @wp.kernel
 def sample_edges(
     first: wp.int32,
@@ -147,36 +267,32 @@ def sample_edges(
     edges: EdgeSettings,
     guides: Guides,
     light: Filtered,
-    beauty: wp.array(dtype=wp.vec3),
+    picture: Picture,
 ):
     p = tiled_pixel(first + wp.tid(), camera.width)
     if p[0] >= camera.width or p[1] >= camera.height:
         return
-    if not is_edge(settings, guides, p[0], p[1]):
+    edge = edge_of(settings, guides, p[0], p[1])
+    if edge == 0:
         return
     pixel = p[1] * camera.width + p[0]
     seed = hash_uint(edges.seed ^ wp.uint32(pixel))
-    total = wp.vec3(0.0, 0.0, 0.0)
-    count = float(0.0)
-    for k in range(edges.samples):
-        u = sample_2d(wp.uint32(k), seed, CAMERA_DIMENSION)
-        px = wp.float32(p[0]) + 0.5 + filter_offset(edges.tent, u[0])
-        py = wp.float32(p[1]) + 0.5 + filter_offset(edges.tent, u[1])
-        direction = camera_ray(camera, px, py)
-        hit = bvh_intersect(scene.bvh, camera.position, direction, float(wp.inf))
-        if hit.face < 0:
-            total += environment_radiance(scene.environment, direction)
-            count += 1.0
-        else:
-            s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
-            known = shared_light(settings, guides, light, s, hit.t, px, py)
-            if known.seen:
-                lit = wp.cw_mul(s.bsdf.diffuse, known.diffuse)
-                lit += wp.cw_mul(glossy_scale(average_specular(s.bsdf)), known.glossy)
-                total += lit + surface_emission(scene, hit.face, hit.u, hit.v, -direction)
-                count += 1.0
-    if count > 0.0:
-        beauty[pixel] = total / count
+    own = wp.float32(edges.own)
+    sums = EdgeSums()
+    sums.reflected = (picture.beauty[pixel] - picture.shining[pixel]) * own
+    sums.shining = picture.shining[pixel] * own
+    sums.count = own
+    more = edges.samples - edges.own
+    if edge == 1:
+        more = wp.max(2 * more / 3, 1)
+    for k in range(more):
+        at = wp.vec2(wp.float32(p[0]) + 0.5, wp.float32(p[1]) + 0.5) + sample_offset(edges, more, k, seed)
+        sums = with_sample(scene, camera, settings, guides, light, pixel, at, sums)
+    if sums.count > 0.0:
+        picture.beauty[pixel] = (sums.reflected + sums.shining) / sums.count
+        picture.shining[pixel] = sums.shining / sums.count
+    if not sums.differ:
+        picture.less[pixel] = wp.max(picture.less[pixel], LESS_HISTORY)
 
 
 # Value of a picture at coordinates in units of pixels from the first pixel's middle: Catmull-Rom, within the range of
@@ -215,19 +331,38 @@ def catmull_rom(f: wp.float32, number: wp.int32) -> wp.float32:
     return f * f * (-0.5 + 0.5 * f)
 
 
-# Thread: a pixel. Averages the picture with the last one, which moves as the nearest of the surfaces around does.
+# Thread: a pixel. The last picture counts less where light has changed.
+@wp.kernel
+def mark_changes(first: wp.int32, settings: DenoiseSettings, changes: Changes, less: wp.array(dtype=wp.float32)):
+    i = first + wp.tid()
+    y = i / settings.width
+    x = i - y * settings.width
+    rows = changes.diffuse.shape[0] / changes.columns
+    diffuse = change_at(changes.diffuse, changes.columns, rows, x, y)
+    less[i] = wp.max(diffuse, change_at(changes.glossy, changes.columns, rows, x, y))
+
+
+# Thread: a pixel. Averages reflected light with that of the last picture, which moves as the nearest of the surfaces
+# around does, and counts less where all samples of a pixel at an edge show the same: there it is what others beside it
+# left as it moved by fractions of a pixel. Writes the beauty, and the reflected light for the next frame. Of a weight
+# of 1 there is no last picture.
 @wp.kernel
 def average_pictures(
     first: wp.int32,
     settings: DenoiseSettings,
     edges: EdgeSettings,
-    depth: wp.array(dtype=wp.float32),
-    motion: wp.array(dtype=wp.vec2),
-    picture: wp.array(dtype=wp.vec3),
+    seen: Seen,
+    picture: Picture,
     last: wp.array(dtype=wp.vec3),
-    out: wp.array(dtype=wp.vec3),
+    kept: wp.array(dtype=wp.vec3),
+    beauty: wp.array(dtype=wp.vec3),
 ):
     i = first + wp.tid()
+    own = picture.beauty[i] - picture.shining[i]
+    kept[i] = own
+    beauty[i] = picture.beauty[i]
+    if edges.weight >= 1.0:
+        return
     y = i / settings.width
     x = i - y * settings.width
     nearest = int(i)
@@ -239,19 +374,21 @@ def average_pictures(
         ty = y + k / 3 - 1
         if tx >= 0 and tx < settings.width and ty >= 0 and ty < settings.height:
             j = ty * settings.width + tx
-            if depth[j] < depth[nearest]:
+            if seen.depth[j] < seen.depth[nearest]:
                 nearest = j
-            total += picture[j]
-            squares += wp.cw_mul(picture[j], picture[j])
+            light = picture.beauty[j] - picture.shining[j]
+            total += light
+            squares += wp.cw_mul(light, light)
             count += 1.0
-    px = wp.float32(x) + motion[nearest][0]
-    py = wp.float32(y) + motion[nearest][1]
+    px = wp.float32(x) + seen.motion[nearest][0]
+    py = wp.float32(y) + seen.motion[nearest][1]
     inside = px >= 0.0 and px <= wp.float32(settings.width - 1) and py >= 0.0 and py <= wp.float32(settings.height - 1)
-    out[i] = picture[i]
     if inside:
         mean = total / count
         spread = wp.max(squares / count - wp.cw_mul(mean, mean), wp.vec3(0.0, 0.0, 0.0))
         margin = edges.clip * wp.vec3(wp.sqrt(spread[0]), wp.sqrt(spread[1]), wp.sqrt(spread[2]))
         before = sharp_value(last, settings.width, settings.height, px, py)
         before = wp.min(wp.max(before, mean - margin), mean + margin)
-        out[i] = before * (1.0 - edges.weight) + picture[i] * edges.weight
+        weight = edges.weight + (1.0 - edges.weight) * picture.less[i]
+        kept[i] = before * (1.0 - weight) + own * weight
+        beauty[i] = kept[i] + picture.shining[i]

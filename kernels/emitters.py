@@ -44,18 +44,18 @@ class LightSample:
 
 # Whether a ray can meet an emissive triangle at all: whether it meets the box around them.
 @wp.func
-def may_hit_emitter(e: Emitters, origin: wp.vec3, direction: wp.vec3) -> wp.bool:
+def may_hit_emitter(emitters: Emitters, origin: wp.vec3, direction: wp.vec3) -> wp.bool:
     enter = float(0.0)
     leave = float(wp.inf)
     for axis in range(3):
         d = direction[axis]
         if wp.abs(d) < 1.0e-12:
             d = 1.0e-12
-        a = (e.lower[axis] - origin[axis]) / d
-        b = (e.upper[axis] - origin[axis]) / d
+        a = (emitters.lower[axis] - origin[axis]) / d
+        b = (emitters.upper[axis] - origin[axis]) / d
         enter = wp.max(enter, wp.min(a, b))
         leave = wp.min(leave, wp.max(a, b))
-    return enter <= leave and e.lower[0] <= e.upper[0]
+    return enter <= leave and emitters.lower[0] <= emitters.upper[0]
 
 
 # Solid-angle pdf of a point uniform on an emissive triangle.

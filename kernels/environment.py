@@ -51,6 +51,7 @@ def lat_long_encode(direction: wp.vec3) -> wp.vec2:
 @wp.struct
 class Patch:
     row: wp.int32
+    column: wp.int32  # may be -1
     s: wp.float32  # from left to right
     t: wp.float32  # from upper to lower
     upper_left: wp.vec3
@@ -64,6 +65,7 @@ class Patch:
 def patch_nodes(env: Environment, row: wp.int32, column: wp.int32) -> Patch:
     r = Patch()
     r.row = row
+    r.column = column
     left = column
     if left < 0:
         left += env.width
@@ -140,6 +142,31 @@ def environment_lookup(env: Environment, direction: wp.vec3) -> EnvironmentLooku
     return r
 
 
+# A direction under the tent of a node of the map, by two uniform numbers in [0, 1): azimuth and polar angle.
+@wp.func
+def node_sample(env: Environment, node: wp.int32, across: wp.float32, down: wp.float32) -> EnvironmentSample:
+    r = EnvironmentSample()
+    r.row = node / env.width
+    r.column = node - r.row * env.width
+    if across < 0.5:
+        r.column -= 1
+        r.s = wp.sqrt(2.0 * across)
+    else:
+        r.s = 1.0 - wp.sqrt(2.0 - 2.0 * across)
+    above = env.row_pdfs[r.row]
+    share = above / (above + env.row_pdfs[r.row + 1])
+    if down < share:
+        r.row -= 1
+        r.t = wp.sqrt(down / share)
+    else:
+        r.t = 1.0 - wp.sqrt((1.0 - down) / (1.0 - share))
+    polar = polar_angle(r.row, r.t, env.height)
+    around = circle((wp.float32(r.column) + 0.5 + r.s) / wp.float32(env.width)) * polar[1]
+    local = wp.vec3(around[1], polar[0], -around[0])
+    r.direction = wp.transpose(env.environment_from_world) * local
+    return r
+
+
 # A direction by the luminance from there, from three uniform numbers in [0, 1): u[0] with further digits u[2] picks a
 # node and then the azimuth under its tent, u[1] the polar angle.
 @wp.func
@@ -147,25 +174,8 @@ def environment_sample(env: Environment, u: wp.vec3) -> EnvironmentSample:
     r = EnvironmentSample()
     if env.kind == ENVIRONMENT_MAP:
         choice = alias_choice(env.alias, env.width * env.height, u[0], u[2])
-        r.row = choice.item / env.width
-        r.column = choice.item - r.row * env.width
-        if choice.remainder < 0.5:
-            r.column -= 1
-            r.s = wp.sqrt(2.0 * choice.remainder)
-        else:
-            r.s = 1.0 - wp.sqrt(2.0 - 2.0 * choice.remainder)
-        above = env.row_pdfs[r.row]
-        share = above / (above + env.row_pdfs[r.row + 1])
-        if u[1] < share:
-            r.row -= 1
-            r.t = wp.sqrt(u[1] / share)
-        else:
-            r.t = 1.0 - wp.sqrt((1.0 - u[1]) / (1.0 - share))
-        polar = polar_angle(r.row, r.t, env.height)
-        around = circle((wp.float32(r.column) + 0.5 + r.s) / wp.float32(env.width)) * polar[1]
-        local = wp.vec3(around[1], polar[0], -around[0])
-        r.direction = wp.transpose(env.environment_from_world) * local
-    elif env.kind == ENVIRONMENT_CONSTANT:
+        return node_sample(env, choice.item, choice.remainder, u[1])
+    if env.kind == ENVIRONMENT_CONSTANT:
         z = 1.0 - 2.0 * u[1]
         ring = wp.sqrt(wp.max(0.0, 1.0 - z * z))
         r.direction = wp.vec3(ring * wp.cos(TWO_PI * u[0]), z, ring * wp.sin(TWO_PI * u[0]))
@@ -174,15 +184,15 @@ def environment_sample(env: Environment, u: wp.vec3) -> EnvironmentSample:
 
 # What comes from the direction of a sample, and the density of such samples: as environment_lookup says of it.
 @wp.func
-def environment_arrival(env: Environment, e: EnvironmentSample) -> EnvironmentLookup:
+def environment_arrival(env: Environment, drawn: EnvironmentSample) -> EnvironmentLookup:
     r = EnvironmentLookup()
     if env.kind == ENVIRONMENT_MAP:
-        patch = patch_nodes(env, e.row, e.column)
-        patch.s = e.s
-        patch.t = e.t
+        patch = patch_nodes(env, drawn.row, drawn.column)
+        patch.s = drawn.s
+        patch.t = drawn.t
         texel = patch_texel(patch)
         r.radiance = wp.cw_mul(texel, env.radiance)
-        r.pdf = patch_pdf(env, e.row, texel, polar_angle(e.row, e.t, env.height)[1])
+        r.pdf = patch_pdf(env, drawn.row, texel, polar_angle(drawn.row, drawn.t, env.height)[1])
     elif env.kind == ENVIRONMENT_CONSTANT:
         r.radiance = env.radiance
         r.pdf = UNIFORM_SPHERE_PDF

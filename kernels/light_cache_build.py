@@ -239,7 +239,7 @@ def weigh_light_samples(
     tables: CacheTables,
 ):
     leaf = first + wp.tid()
-    e = known_exploration(known, origins[leaf], settings)
+    exploration = known_exploration(known, origins[leaf], settings)
     count = samples.counts[leaf]
     looks = wp.min(count, samples.most)
     m = LightMoments()
@@ -247,7 +247,7 @@ def weigh_light_samples(
     for k in range(looks):
         slot = samples.order[samples.starts[leaf] + spread_place(k, looks, count)]
         word = records.lights[slot]
-        m = add_light_sample(m, word, records.light_values[slot], records.rivals[slot], e.share)
+        m = add_light_sample(m, word, records.light_values[slot], records.rivals[slot], exploration.share)
         was_tried = (word & (LIGHT_VISIBLE | LIGHT_BLOCKED)) != wp.uint32(0)
         if was_tried and (word & LIGHT_EXPLORED) == wp.uint32(0):
             place = find_entry(joined, leaf, wp.int32(word & LIGHT_ITEM) - 1)
@@ -255,11 +255,11 @@ def weigh_light_samples(
             sightings += seen
             if place >= 0:
                 joined.tries[place] = joined.tries[place] + wp.vec2(wp.float32(seen), 1.0)
-    if e.has_lights and count > 0:
-        e = learnt_exploration(e, m, settings)
+    if exploration.has_lights and count > 0:
+        exploration = learnt_exploration(exploration, m, settings)
     elif count > 0:  # all of the light came by exploring, which says nothing of what the cache would do
-        e = started_exploration(e, sightings, joined.counts[leaf], settings)
-    keep_exploration(tables, leaf, e, settings)
+        exploration = started_exploration(exploration, sightings, joined.counts[leaf], settings)
+    keep_exploration(tables, leaf, exploration, settings)
     begin = joined.offsets[leaf]
     for i in range(begin, begin + joined.counts[leaf]):
         tries = joined.tries[i]

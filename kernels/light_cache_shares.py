@@ -164,19 +164,19 @@ def started_exploration(e: Exploration, sightings: wp.int32, lights: wp.int32, s
 
 
 @wp.func
-def learnt_exploration(e: Exploration, m: LightMoments, settings: CacheSettings) -> Exploration:
-    r = e
-    r.moments = e.moments * FADING + wp.vec2(m.offered, m.explored * e.share + unmet_moment(m))
+def learnt_exploration(exploration: Exploration, m: LightMoments, settings: CacheSettings) -> Exploration:
+    r = exploration
+    r.moments = exploration.moments * FADING + wp.vec2(m.offered, m.explored * exploration.share + unmet_moment(m))
     r.share = exploration_share(r.moments, settings)
-    r.excess = e.excess * FADING + variance_excess(m, e.share)
+    r.excess = exploration.excess * FADING + variance_excess(m, exploration.share)
     if r.excess != 0.0 and settings.may_be_alone != 0:
         r.alone = wp.where(r.excess > 0.0, 1, 0)
     return r
 
 
 @wp.func
-def keep_exploration(tables: CacheTables, leaf: wp.int32, e: Exploration, settings: CacheSettings):
-    tables.exploration[leaf] = wp.clamp(e.share, settings.least_exploration, settings.most_exploration)
-    tables.alone[leaf] = e.alone
-    tables.moments[leaf] = e.moments
-    tables.excesses[leaf] = e.excess
+def keep_exploration(tables: CacheTables, leaf: wp.int32, exploration: Exploration, settings: CacheSettings):
+    tables.exploration[leaf] = wp.clamp(exploration.share, settings.least_exploration, settings.most_exploration)
+    tables.alone[leaf] = exploration.alone
+    tables.moments[leaf] = exploration.moments
+    tables.excesses[leaf] = exploration.excess

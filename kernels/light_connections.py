@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_gi.kernels.bsdf import bsdf_evaluate
 from warp_gi.kernels.bvh import bvh_occluded
-from warp_gi.kernels.emitters import LightChoice, sample_emitter
+from warp_gi.kernels.emitters import LightChoice, LightSample, sample_emitter
 from warp_gi.kernels.environment import EnvironmentSample, environment_arrival
 from warp_gi.kernels.sampling import (
     EXPLORE_DIGITS_DIMENSION,
@@ -55,10 +55,10 @@ def connect_direction(scene: SceneData, s: Surface, wo: wp.vec3, direction: wp.v
 
 
 @wp.func
-def connect_sky(scene: SceneData, s: Surface, wo: wp.vec3, e: EnvironmentSample) -> LightConnection:
-    r = connect_direction(scene, s, wo, e.direction)
+def connect_sky(scene: SceneData, s: Surface, wo: wp.vec3, drawn: EnvironmentSample) -> LightConnection:
+    r = connect_direction(scene, s, wo, drawn.direction)
     if r.arrives != 0:
-        source = environment_arrival(scene.environment, e)
+        source = environment_arrival(scene.environment, drawn)
         if source.pdf <= 0.0:
             return LightConnection()
         r.reflected = wp.cw_mul(r.scattered, source.radiance)
@@ -68,23 +68,28 @@ def connect_sky(scene: SceneData, s: Surface, wo: wp.vec3, e: EnvironmentSample)
 
 @wp.func
 def connect_emitter(scene: SceneData, s: Surface, wo: wp.vec3, choice: LightChoice, u: wp.vec2) -> LightConnection:
-    r = LightConnection()
     origin = ray_origin(s)
-    e = sample_emitter(scene, origin, choice, u)
-    if e.pdf <= 0.0 or wp.dot(e.direction, s.normal) <= 0.0:
+    return connect_light(scene, s, wo, origin, sample_emitter(scene, origin, choice, u))
+
+
+# Whether a sample of a light, taken at `origin`, arrives.
+@wp.func
+def connect_light(scene: SceneData, s: Surface, wo: wp.vec3, origin: wp.vec3, drawn: LightSample) -> LightConnection:
+    r = LightConnection()
+    if drawn.pdf <= 0.0 or wp.dot(drawn.direction, s.normal) <= 0.0:
         return r
-    f = bsdf_evaluate(s.bsdf, wo, wp.transpose(s.shading) * e.direction)
-    if f.pdf <= 0.0 or wp.max(e.radiance) <= 0.0:
+    f = bsdf_evaluate(s.bsdf, wo, wp.transpose(s.shading) * drawn.direction)
+    if f.pdf <= 0.0 or wp.max(drawn.radiance) <= 0.0:
         return r
-    if bvh_occluded(scene.bvh, origin, e.direction, e.distance * SHADOW_END):
+    if bvh_occluded(scene.bvh, origin, drawn.direction, drawn.distance * SHADOW_END):
         r.arrives = -1
         return r
     r.arrives = 1
-    r.direction = e.direction
-    r.reflected = wp.cw_mul(f.value, e.radiance)
-    r.pdf = e.pdf
+    r.direction = drawn.direction
+    r.reflected = wp.cw_mul(f.value, drawn.radiance)
+    r.pdf = drawn.pdf
     r.bsdf_pdf = f.pdf
-    r.delta = e.delta
+    r.delta = drawn.delta
     return r
 
 

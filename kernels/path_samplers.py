@@ -66,6 +66,20 @@ class Regions(NamedTuple):
     end: wp.Function  # (data, slot, vertices, light of the path)
 
 
+class ApartLights(NamedTuple):
+    """Lights far brighter than they are large, which all get a ray of their own at the first vertex.
+
+    Samples of the sky and of emitters leave them out there. Diffuse light of theirs comes by these rays alone, and
+    stays apart; glossy light by the direction samples, too.
+    """
+
+    count: wp.Function  # (data) -> int
+    is_sky: wp.Function  # (data, light) -> bool: whether it is a part of the sky, not an emitter
+    sample: wp.Function  # (data, scene, position, light, u: vec2) -> LightSample; radiance over pdf
+    lookup: wp.Function  # (data, scene, direction) -> EnvironmentLookup: of those in the sky alone
+    holds_emitters: wp.Function  # (data) -> bool: whether all emitters are among them; if not, none is
+
+
 class Sky(NamedTuple):
     """What a path meets where it leaves the scene: radiance, or someone who records that it came.
 
@@ -88,13 +102,16 @@ class Sky(NamedTuple):
     # (data, scene) -> bool: whether vertices sample it, too. If not, as of a constant sky, only directions that leave
     # count, with all of their weight.
     is_sampled: wp.Function
-    prefetch: wp.Function  # (data, scene, u: vec3): called ahead of `sample` with the same numbers
-    sample: wp.Function  # (data, scene, u: vec3) -> EnvironmentSample
-    arrival: wp.Function  # (data, scene, EnvironmentSample) -> EnvironmentLookup: asked if nothing stands in between
-    lookup: wp.Function  # (data, scene, direction) -> EnvironmentLookup, whose pdf is that of `sample`
-    radiance: wp.Function  # (data, scene, direction) -> that of `lookup` alone, for camera rays that hit nothing
+    # `first` says whether the vertex is the first one, where lights may be apart
+    prefetch: wp.Function  # (data, scene, u: vec3, first): called ahead of `sample` with the same numbers
+    sample: wp.Function  # (data, scene, u: vec3, first) -> EnvironmentSample
+    # (data, scene, EnvironmentSample, first) -> EnvironmentLookup: asked if nothing stands in between
+    arrival: wp.Function
+    lookup: wp.Function  # (data, scene, direction, first) -> EnvironmentLookup, whose pdf is that of `sample`
+    radiance: wp.Function  # (data, scene, direction) -> all of it, for camera rays that hit nothing
     # (data, path: int64, edges of the path from the camera to the sky: 2 is direct light, direction, weight: vec3)
     leave: wp.Function
+    apart: ApartLights | None = None
 
 
 class PathCache(NamedTuple):
@@ -115,6 +132,9 @@ class PathCache(NamedTuple):
     # (data, surface, wo) -> probability with which a path goes on by the GGX lobe alone, which is not in what is known;
     # 0: it is. Asked where the path would end in a cache that holds direct light.
     lobe: wp.Function | None = None
+    # Whether `lookup`, and `lobe` where it tells 0 from more, go by place, geometric normal and BSDF alone. The frame
+    # of shading and wo, which are zero there, are then worked out where a path goes on: a third of a surface's time.
+    by_place: bool = False
 
 
 # What a radiance cache says of a vertex.
@@ -277,22 +297,22 @@ def scene_sky_is_sampled(data: SceneSky, scene: SceneData) -> wp.bool:
 
 
 @wp.func
-def scene_sky_prefetch(data: SceneSky, scene: SceneData, u: wp.vec3):
+def scene_sky_prefetch(data: SceneSky, scene: SceneData, u: wp.vec3, first: wp.bool):
     environment_prefetch(scene.environment, u)
 
 
 @wp.func
-def scene_sky_sample(data: SceneSky, scene: SceneData, u: wp.vec3) -> EnvironmentSample:
+def scene_sky_sample(data: SceneSky, scene: SceneData, u: wp.vec3, first: wp.bool) -> EnvironmentSample:
     return environment_sample(scene.environment, u)
 
 
 @wp.func
-def scene_sky_arrival(data: SceneSky, scene: SceneData, e: EnvironmentSample) -> EnvironmentLookup:
+def scene_sky_arrival(data: SceneSky, scene: SceneData, e: EnvironmentSample, first: wp.bool) -> EnvironmentLookup:
     return environment_arrival(scene.environment, e)
 
 
 @wp.func
-def scene_sky_lookup(data: SceneSky, scene: SceneData, direction: wp.vec3) -> EnvironmentLookup:
+def scene_sky_lookup(data: SceneSky, scene: SceneData, direction: wp.vec3, first: wp.bool) -> EnvironmentLookup:
     return environment_lookup(scene.environment, direction)
 
 

@@ -26,6 +26,7 @@ from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, tiled
 from warp_gi.kernels.light_connections import (
     connect_direction,
     connect_emitter,
+    connect_light,
     explore_2d,
     explore_3d,
     light_1d,
@@ -47,6 +48,7 @@ from warp_gi.kernels.path_samplers import (
     sample_weight,
 )
 from warp_gi.kernels.sampling import (
+    APART_DIMENSION,
     CACHE_DIMENSION,
     CACHE_LOBE_DIMENSION,
     CACHE_PLACE_DIMENSION,
@@ -62,10 +64,13 @@ from warp_gi.kernels.sampling import (
     pixel_sample_index,
     pixel_seed,
     random_1d,
+    sample_2d,
 )
 from warp_gi.kernels.surface import (
     Surface,
+    bare_surface,
     ray_origin,
+    shading_frame,
     surface_at,
     surface_emission,
     surface_prefetch,
@@ -98,7 +103,7 @@ class PathSettings:
 
 
 # Radiance of one path, by term; and by the lobe of the first vertex that reflects it, if asked for, but for what a
-# radiance cache knows there.
+# radiance cache knows there. Diffuse light of lights that are apart is in `apart` only.
 @wp.struct
 class PathRadiance:
     environment: wp.vec3
@@ -106,6 +111,7 @@ class PathRadiance:
     indirect: wp.vec3
     diffuse: wp.vec3
     glossy: wp.vec3
+    apart: wp.vec3
 
 
 # Sums over samples, [height * width].
@@ -116,6 +122,7 @@ class PathBuffers:
     indirect: wp.array(dtype=wp.vec3)
     lobe_diffuse: wp.array(dtype=wp.vec3)  # as Frame.lobes, or empty
     lobe_glossy: wp.array(dtype=wp.vec3)
+    lobe_apart: wp.array(dtype=wp.vec3)
     moment1: wp.array(dtype=wp.vec3)  # of the samples of beauty
     moment2: wp.array(dtype=wp.vec3)  # of their squares
 
@@ -126,6 +133,9 @@ def add_lobes(buffers: PathBuffers, pixel: wp.int32, s: Surface, r: PathRadiance
     incident = divided(r.diffuse, s.bsdf.diffuse, LEAST_REFLECTANCE)
     buffers.lobe_diffuse[pixel] = buffers.lobe_diffuse[pixel] + incident
     buffers.lobe_glossy[pixel] = buffers.lobe_glossy[pixel] + r.glossy
+    if buffers.lobe_apart.shape[0] > 0:
+        direct = divided(r.apart, s.bsdf.diffuse, LEAST_REFLECTANCE)
+        buffers.lobe_apart[pixel] = buffers.lobe_apart[pixel] + direct
 
 
 class PathTracer(NamedTuple):
@@ -166,6 +176,8 @@ def _made(
     light_data, direction_data, region_data = lights.data, directions.data, regions.data
     holds_direct, lobe_probability = cache.holds_direct, cache.lobe or no_lobe
     sky_data, cache_data, has_cache = sky.data, cache.data, cache is not NO_CACHE
+    apart, parts_lights = sky.apart, sky.apart is not None
+    shades_late = cache.by_place and regions is NO_REGIONS
     explore, choices = (no_light, 1) if lights.explore is None else (lights.explore, 2)
 
     @wp.struct
@@ -205,6 +217,7 @@ def _made(
         samples_sky = sky.is_sampled(samplers.sky, scene)
         sharpness = float(wp.inf)
         corrects = bool(False)
+        is_bare = bool(False)  # without its frame of shading yet
         # light before the way on from the first vertex, and the diffuse lobe's share of what comes from there
         before = wp.vec3(0.0, 0.0, 0.0)
         diffuse_share = wp.vec3(0.0, 0.0, 0.0)
@@ -236,6 +249,12 @@ def _made(
                         ends = random_1d(index, seed, d + CACHE_DIMENSION) < known.validity
                     if ends:
                         r.indirect = r.indirect + wp.cw_mul(throughput, known.radiance)
+                    if shades_late:
+                        is_read = ends and known.follow <= 0.0 and lobe_probability(samplers.cache, s, wo) <= 0.0
+                        if is_bare and not is_read:
+                            s.shading = shading_frame(scene, hit.face, hit.u, hit.v, s.uv, view)
+                            wo = wp.transpose(s.shading) * view
+                        is_bare = False
                     if holds_direct:
                         if ends:
                             goes = lobe_probability(samplers.cache, s, wo)
@@ -267,6 +286,8 @@ def _made(
                 emitter_share = 1.0
                 wants_sky = samples_sky and (paths.terms & TERM_ENVIRONMENT) != 0
                 wants_emitter = wants_emitter and (paths.terms & TERM_EMITTERS) != 0
+                if parts_lights:
+                    wants_emitter = wants_emitter and not apart.holds_emitters(samplers.sky)
             elif u_select[0] < sky_share:
                 wants_emitter = False
             else:
@@ -276,7 +297,7 @@ def _made(
             if wants_sky:
                 u2 = light_2d(index, seed, d + SKY_DIMENSION, at_first)
                 u_sky = wp.vec3(u2[0], u2[1], random_1d(index, seed, d + SKY_DIGITS_DIMENSION))
-                sky.prefetch(samplers.sky, scene, u_sky)
+                sky.prefetch(samplers.sky, scene, u_sky, at_first)
 
             # the way on: ends the path at a light, or continues it
             is_last = ends or depth == paths.max_depth or (at_first and (paths.terms & TERM_INDIRECT) == 0)
@@ -305,11 +326,33 @@ def _made(
             if goes_on or wants_sky or wants_emitter:
                 s = with_color(scene, s)
             # light sampling; after the ray above, which gives memory the time to answer the prefetches
+            if parts_lights:
+                if at_first:
+                    for k in range(apart.count(samplers.sky)):
+                        from_sky = apart.is_sky(samplers.sky, k)
+                        u_apart = wp.vec2(0.0, 0.0)
+                        if from_sky:
+                            u_apart = sample_2d(index, seed, APART_DIMENSION + k)
+                        beam = apart.sample(samplers.sky, scene, ray_origin(s), k, u_apart)
+                        ray = connect_light(scene, s, wo, ray_origin(s), beam)
+                        if ray.arrives > 0:
+                            part = diffuse_part(s.bsdf, wo, wp.transpose(s.shading) * ray.direction)
+                            by_diffuse = wp.cw_mul(part, ray.reflected)
+                            by_glossy = ray.reflected - by_diffuse
+                            if ray.delta == 0:
+                                pdf = directions.pdf(samplers.directions, region, s, ray.direction, ray.bsdf_pdf)
+                                by_glossy = by_glossy * balance(ray.pdf, pdf)
+                            r.apart = r.apart + by_diffuse
+                            r.glossy = r.glossy + by_glossy
+                            if from_sky:
+                                r.environment = r.environment + by_diffuse + by_glossy
+                            else:
+                                r.emitters = r.emitters + by_diffuse + by_glossy
             if wants_sky:
-                sky_sample = sky.sample(samplers.sky, scene, u_sky)
+                sky_sample = sky.sample(samplers.sky, scene, u_sky, at_first)
                 way = connect_direction(scene, s, wo, sky_sample.direction)
                 if way.arrives != 0:
-                    source = sky.arrival(samplers.sky, scene, sky_sample)
+                    source = sky.arrival(samplers.sky, scene, sky_sample, at_first)
                     if source.pdf > 0.0:
                         pdf = directions.pdf(samplers.directions, region, s, way.direction, way.bsdf_pdf)
                         scattered = way.scattered / (source.pdf * sky_share + pdf)
@@ -317,7 +360,7 @@ def _made(
                         if path >= wp.int64(0):
                             sky.leave(samplers.sky, path, depth, way.direction, wp.cw_mul(throughput, scattered))
                         if at_first:
-                            r.environment = light
+                            r.environment = r.environment + light
                             if paths.lobes != 0:
                                 part = diffuse_part(s.bsdf, wo, wp.transpose(s.shading) * way.direction)
                                 r.diffuse = r.diffuse + wp.cw_mul(part, light)
@@ -371,7 +414,7 @@ def _made(
                     regions.direction(samplers.regions, at, b, 0.0, carried, luminance(r.environment + r.indirect))
                 vertices += 1
                 if sees_sky:
-                    beyond = sky.lookup(samplers.sky, scene, wi)
+                    beyond = sky.lookup(samplers.sky, scene, wi, at_first)
                     light = wp.cw_mul(throughput, beyond.radiance)
                     share = float(1.0)
                     if samples_sky:
@@ -381,6 +424,14 @@ def _made(
                         sky.leave(samplers.sky, path, depth, wi, throughput * share)
                     if at_first:
                         r.environment = r.environment + light
+                        if parts_lights:
+                            lamp = apart.lookup(samplers.sky, scene, wi)
+                            if lamp.pdf > 0.0:
+                                light = wp.cw_mul(throughput, lamp.radiance) * balance(b.pdf, lamp.pdf)
+                                light = light - wp.cw_mul(diffuse_share, light)
+                                r.environment = r.environment + light
+                                r.glossy = r.glossy + light
+                                before = before + light
                     else:
                         r.indirect = r.indirect + light
                 break
@@ -411,7 +462,12 @@ def _made(
             if has_cache:
                 sharpness = wp.min(sharpness, b.pdf)
             view = -wi
-            s = surface_shape(scene, hit.face, hit.u, hit.v, view)
+            if shades_late:
+                is_bare = not corrects and depth >= paths.cache_vertex
+            if is_bare:
+                s = bare_surface(scene, hit.face, hit.u, hit.v, view, 0)
+            else:
+                s = surface_shape(scene, hit.face, hit.u, hit.v, view)
         if slot >= 0:
             regions.end(samplers.regions, slot, vertices, luminance(r.environment + r.indirect))
         if paths.lobes != 0:

@@ -44,6 +44,9 @@ EXPLORE_DIMENSION = wp.constant(12288)  # which other light to explore (random),
 EXPLORE_POINT_DIMENSION = wp.constant(12289)  # a pair for the point on it (random),
 EXPLORE_DIGITS_DIMENSION = wp.constant(2)  # and how far from that pair is another one, for the choice
 
+# Lights that have a ray of their own at the first vertex of a path: the point on it (2d), so many as there may be.
+APART_DIMENSION = wp.constant(2009)
+
 # Rays from pixels that end in light field probes, beside the path that may go on from where they end: its vertices
 # stay below, as it has BsdfPaths' default depth.
 PROBE_LOBE_DIMENSION = wp.constant(2000)
@@ -174,6 +177,22 @@ def sample_1d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32) -> wp.floa
 """
 )
 def random_1d(index: wp.uint32, seed: wp.uint32, dimension: wp.int32) -> wp.float32: ...
+
+
+PAIR_SALT = wp.constant(wp.uint32(0x9E3779B9))
+NUMBER_SALT = wp.constant(wp.uint32(0x85EBCA6B))
+
+
+# The hashes of seed and dimension within sample_2d, and within random_1d, for code that draws many numbers.
+@wp.func
+def pair_keys(seed: wp.uint32, dimension: wp.int32) -> wp.vec3ui:
+    key = hash_uint(seed ^ hash_uint(wp.uint32(dimension) + PAIR_SALT))
+    return wp.vec3ui(key, hash_uint(key + wp.uint32(1)), hash_uint(key + wp.uint32(2)))
+
+
+@wp.func
+def random_key(seed: wp.uint32, dimension: wp.int32) -> wp.uint32:
+    return hash_uint(seed + hash_uint(wp.uint32(dimension) + NUMBER_SALT))
 
 
 # (cos, sin) of 2 pi u for u in [0, 1]; polynomials, so no call breaks a loop, and every machine agrees.

@@ -2,9 +2,9 @@
 
 import warp as wp
 
-from warp_gi.kernels.bsdf import Bsdf, make_bsdf
+from warp_gi.kernels.bsdf import Bsdf, make_bsdf, make_coated_bsdf
 from warp_gi.kernels.sampling import frame_of
-from warp_gi.kernels.types import WRAP_CLAMP, WRAP_MIRROR, WRAP_REPEAT, Geometry, SceneData, Texture
+from warp_gi.kernels.types import WRAP_CLAMP, WRAP_MIRROR, WRAP_REPEAT, Geometry, Material, SceneData, Texture
 
 wp.set_module_options({"enable_backward": False})
 
@@ -57,12 +57,15 @@ def texel_color(scene: SceneData, index: wp.int32, srgb: wp.int32) -> wp.vec4:
     return wp.vec4(wp.float32(r), wp.float32(g), wp.float32(b), a * 255.0) / 255.0
 
 
-# Bilinear lookup, colours linear.
+# Bilinear lookup, or the nearest texel where the texture asks for it; colours linear.
 @wp.func
 def texture_lookup(scene: SceneData, texture: wp.int32, uv: wp.vec2) -> wp.vec4:
     t = scene.textures[texture]
     x = texel_coordinate(uv[0], t.width, t.wrap_u)
     y = texel_coordinate(uv[1], t.height, t.wrap_v)
+    if t.nearest != 0:
+        x = wp.floor(x + 0.5)
+        y = wp.floor(y + 0.5)
     fx = x - wp.floor(x)
     fy = y - wp.floor(y)
     i = wp.int32(wp.floor(x))
@@ -83,14 +86,44 @@ def triangle_uv(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32) 
     return uvs[ids[0]] * (1.0 - u - v) + uvs[ids[1]] * u + uvs[ids[2]] * v
 
 
+# Where a texture is looked up at the point (u, v) of a triangle, whose own coordinates there are `uv`.
+@wp.func
+def texture_uv(
+    scene: SceneData, texture: wp.int32, face: wp.int32, u: wp.float32, v: wp.float32, uv: wp.vec2
+) -> wp.vec2:
+    if scene.textures[texture].moved == 0:
+        return uv
+    t = scene.textures[texture]
+    at = uv
+    if t.uv_set != 0:
+        ids = scene.geometry.indices[face]
+        uvs = scene.geometry.further_uvs
+        at = uvs[ids[0]] * (1.0 - u - v) + uvs[ids[1]] * u + uvs[ids[2]] * v
+    p = wp.vec3(at[0], at[1], 1.0)
+    return wp.vec2(wp.dot(t.to_u, p), wp.dot(t.to_v, p))
+
+
+# Colour of the vertices of a scene that has any, at the point (u, v) of a triangle.
+@wp.func
+def vertex_color(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32) -> wp.vec3:
+    ids = scene.geometry.indices[face]
+    colors = scene.geometry.colors
+    color = colors[ids[0]] * (1.0 - u - v) + colors[ids[1]] * u + colors[ids[2]] * v
+    return wp.vec3(color[0], color[1], color[2])
+
+
 # Radiance at a point of an emissive triangle, on its emitting side.
 @wp.func
 def emitted_radiance(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32) -> wp.vec3:
     m = scene.materials[scene.geometry.materials[face]]
+    emission = m.emission
+    if m.colors_emit != 0 and scene.geometry.colors.shape[0] > 0:
+        emission = wp.cw_mul(emission, vertex_color(scene, face, u, v))
     if m.emission_texture < 0:
-        return m.emission
-    texel = texture_lookup(scene, m.emission_texture, triangle_uv(scene, face, u, v))
-    return wp.cw_mul(m.emission, wp.vec3(texel[0], texel[1], texel[2]))
+        return emission
+    uv = texture_uv(scene, m.emission_texture, face, u, v, triangle_uv(scene, face, u, v))
+    texel = texture_lookup(scene, m.emission_texture, uv)
+    return wp.cw_mul(emission, wp.vec3(texel[0], texel[1], texel[2]))
 
 
 # Radiance that the point (u, v) of a triangle emits towards wo.
@@ -115,7 +148,7 @@ def ray_offset(position: wp.vec3, radius: wp.float32) -> wp.float32:
 
 
 # Tangent-space normal of the material's normal map in world space, about the unit normal n.
-# The tangent is dp/du of the triangle, made perpendicular to n.
+# The tangent is dp/du of the triangle in the texture's coordinates, made perpendicular to n.
 @wp.func
 def mapped_normal(
     scene: SceneData, texture: wp.int32, scale: wp.float32, face: wp.int32, uv: wp.vec2, n: wp.vec3
@@ -125,6 +158,10 @@ def mapped_normal(
     e2 = scene.geometry.points[ids[2]] - scene.geometry.points[ids[0]]
     d1 = scene.geometry.uvs[ids[1]] - scene.geometry.uvs[ids[0]]
     d2 = scene.geometry.uvs[ids[2]] - scene.geometry.uvs[ids[0]]
+    if scene.textures[texture].moved != 0:
+        at = texture_uv(scene, texture, face, 0.0, 0.0, scene.geometry.uvs[ids[0]])
+        d1 = texture_uv(scene, texture, face, 1.0, 0.0, scene.geometry.uvs[ids[1]]) - at
+        d2 = texture_uv(scene, texture, face, 0.0, 1.0, scene.geometry.uvs[ids[2]]) - at
     det = d1[0] * d2[1] - d1[1] * d2[0]
     if wp.abs(det) < 1.0e-20:
         return n
@@ -185,29 +222,40 @@ def with_color(scene: SceneData, surface: Surface) -> Surface:
     return s
 
 
-# The point (u, v) of triangle `face` seen from direction wo, all but the texture of a Lambert
-# material: where to go on from there does not depend on it, so a path asks for it (`with_color`)
-# after the next ray, when it has arrived.
+# What a material that is no pure Lambert reflects at a point with the surface's base colour.
 @wp.func
-def surface_shape(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, wo: wp.vec3) -> Surface:
-    s = Surface()
+def coated_bsdf(
+    scene: SceneData, m: Material, base: wp.vec3, face: wp.int32, u: wp.float32, v: wp.float32, uv: wp.vec2
+) -> Bsdf:
+    roughness = m.roughness
+    metallic = m.metallic
+    specular = m.specular
+    reflectance = m.reflectance
+    if m.metallic_roughness_texture >= 0:
+        at = texture_uv(scene, m.metallic_roughness_texture, face, u, v, uv)
+        texel = texture_lookup(scene, m.metallic_roughness_texture, at)
+        roughness = roughness * texel[1]
+        metallic = metallic * texel[2]
+    if m.specular_texture >= 0:
+        at = texture_uv(scene, m.specular_texture, face, u, v, uv)
+        specular = specular * texture_lookup(scene, m.specular_texture, at)[3]
+    if m.reflectance_texture >= 0:
+        at = texture_uv(scene, m.reflectance_texture, face, u, v, uv)
+        texel = texture_lookup(scene, m.reflectance_texture, at)
+        reflectance = wp.cw_mul(reflectance, wp.vec3(texel[0], texel[1], texel[2]))
+    reflectance = wp.min(reflectance, wp.vec3(1.0, 1.0, 1.0))
+    return make_coated_bsdf(base, metallic, roughness, specular, reflectance)
+
+
+# Frame of shading at the point (u, v) of triangle `face` with coordinates uv, seen from direction wo.
+@wp.func
+def shading_frame(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, uv: wp.vec2, wo: wp.vec3) -> wp.mat33:
     g = scene.geometry
     ids = g.indices[face]
     m = scene.materials[g.materials[face]]
-    s.texture = -1
-    if m.base_color_texture >= 0 or m.metallic_roughness_texture >= 0 or m.normal_texture >= 0:
-        s.uv = triangle_uv(scene, face, u, v)
-    if m.base_color_texture >= 0:
-        s.texture = m.base_color_texture
-        texture_prefetch(scene.texels, scene.textures[m.base_color_texture], s.uv[0], s.uv[1])
     p0 = g.points[ids[0]]
-    p1 = g.points[ids[1]]
-    p2 = g.points[ids[2]]
-    w = 1.0 - u - v
-    s.position = p0 * w + p1 * u + p2 * v
-    s.offset = ray_offset(s.position, scene.radius)
-    normal = wp.normalize(wp.cross(p1 - p0, p2 - p0))
-    shading = g.normals[ids[0]] * w + g.normals[ids[1]] * u + g.normals[ids[2]] * v
+    normal = wp.normalize(wp.cross(g.points[ids[1]] - p0, g.points[ids[2]] - p0))
+    shading = g.normals[ids[0]] * (1.0 - u - v) + g.normals[ids[1]] * u + g.normals[ids[2]] * v
     length = wp.length(shading)
     if length <= 1.0e-6:
         shading = normal
@@ -216,28 +264,67 @@ def surface_shape(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32
     else:  # files whose normals point to the back of their triangles
         shading = shading / -length
     if m.normal_texture >= 0:
-        shading = mapped_normal(scene, m.normal_texture, m.normal_scale, face, s.uv, shading)
+        at = texture_uv(scene, m.normal_texture, face, u, v, uv)
+        shading = mapped_normal(scene, m.normal_texture, m.normal_scale, face, at, shading)
     if wp.dot(normal, wo) < 0.0:
-        normal = -normal
         shading = -shading
-    s.normal = normal
     # an interpolated normal may face away from the viewer: bend it until it just does not
     slant = wp.dot(shading, wo)
     if slant < 1.0e-3:
         shading = wp.normalize(shading + wo * (1.0e-3 - slant) * 1.001)
-    s.shading = frame_of(shading)
+    return frame_of(shading)
+
+
+# Starts fetching the texels that the shading of a point needs beside its colour.
+@wp.func
+def shading_prefetch(scene: SceneData, texture: wp.int32, uv: wp.vec2):
+    if texture >= 0:
+        texture_prefetch(scene.texels, scene.textures[texture], uv[0], uv[1])
+
+
+# As surface_shape, but for the frame of shading, which is zero, and normal maps with it: what a look-up by place needs.
+@wp.func
+def bare_surface(
+    scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, wo: wp.vec3, fetches_normals: wp.int32
+) -> Surface:
+    s = Surface()
+    g = scene.geometry
+    ids = g.indices[face]
+    m = scene.materials[g.materials[face]]
+    s.texture = m.base_color_texture
+    textured = m.metallic_roughness_texture >= 0 or m.specular_texture >= 0 or m.reflectance_texture >= 0
+    if textured or m.base_color_texture >= 0 or m.normal_texture >= 0:
+        s.uv = triangle_uv(scene, face, u, v)
+        shading_prefetch(scene, m.base_color_texture, s.uv)
+        shading_prefetch(scene, m.metallic_roughness_texture, s.uv)
+        if fetches_normals != 0:
+            shading_prefetch(scene, m.normal_texture, s.uv)
+    p0 = g.points[ids[0]]
+    p1 = g.points[ids[1]]
+    p2 = g.points[ids[2]]
+    s.position = p0 * (1.0 - u - v) + p1 * u + p2 * v
+    s.offset = ray_offset(s.position, scene.radius)
+    s.normal = wp.normalize(wp.cross(p1 - p0, p2 - p0))
+    if wp.dot(s.normal, wo) < 0.0:
+        s.normal = -s.normal
     s.base_color = m.base_color
+    if g.colors.shape[0] > 0:
+        s.base_color = wp.cw_mul(s.base_color, vertex_color(scene, face, u, v))
     if m.metallic > 0.0 or m.specular > 0.0:
         s = with_color(scene, s)
-        roughness = m.roughness
-        metallic = m.metallic
-        if m.metallic_roughness_texture >= 0:
-            texel = texture_lookup(scene, m.metallic_roughness_texture, s.uv)
-            roughness = roughness * texel[1]
-            metallic = metallic * texel[2]
-        s.bsdf = make_bsdf(s.base_color, metallic, roughness, m.specular)
+        s.bsdf = coated_bsdf(scene, m, s.base_color, face, u, v, s.uv)
     else:
         s.bsdf = make_bsdf(s.base_color, 0.0, 1.0, 0.0)
+    return s
+
+
+# The point (u, v) of triangle `face` seen from direction wo, all but the texture of a Lambert
+# material: where to go on from there does not depend on it, so a path asks for it (`with_color`)
+# after the next ray, when it has arrived.
+@wp.func
+def surface_shape(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, wo: wp.vec3) -> Surface:
+    s = bare_surface(scene, face, u, v, wo, 1)
+    s.shading = shading_frame(scene, face, u, v, s.uv, wo)
     return s
 
 

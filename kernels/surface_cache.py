@@ -158,6 +158,18 @@ def cell_slot(cells: SurfaceCells, key: wp.uint64) -> wp.int32:
     return slot
 
 
+# Starts fetching a slot.
+@wp.func_native(
+    snippet="""
+#if !defined(__CUDA_ARCH__)
+    __builtin_prefetch(&keys.data[slot]);
+    __builtin_prefetch(&values.data[2 * slot]);
+#endif
+"""
+)
+def slot_prefetch(keys: wp.array(dtype=wp.uint64), values: wp.array(dtype=wp.vec4), slot: wp.int32): ...
+
+
 # Slot of the finest cell of `levels` sizes that is known around a point, read at a random place in the tangent plane
 # within a cell of it, which hides the cells' borders, or else at the point itself; -1: none is known.
 @wp.func
@@ -168,6 +180,8 @@ def known_slot(
     across = frame_of(s.normal) * wp.vec3((u[0] - 0.5) * side, (u[1] - 0.5) * side, 0.0)
     beside = cell_key(cells, grid, s.position + across, s.normal, level)
     here = cell_key(cells, grid, s.position, s.normal, level)
+    slot_prefetch(cells.keys, cells.values, first_slot(beside, cells.bits))
+    slot_prefetch(cells.keys, cells.values, first_slot(here, cells.bits))
     slot = int(-1)
     for _k in range(levels):
         if slot < 0:
@@ -227,5 +241,5 @@ def surface_lookup(
     return known
 
 
-SURFACE_CACHE = PathCache("surface", SurfaceCells, surface_lookup, holds_direct=True, lobe=surface_lobe)
+SURFACE_CACHE = PathCache("surface", SurfaceCells, surface_lookup, holds_direct=True, lobe=surface_lobe, by_place=True)
 """Cells of surfaces, which know all light that arrives there."""

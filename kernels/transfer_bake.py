@@ -246,13 +246,13 @@ def light_slots(
     for k in range(lamps.count):
         index = wp.uint32(slot) * wp.uint32(lamps.count) + wp.uint32(k)
         choice = lamp_choice(scene, lamps, index, k)
-        e = sample_emitter(scene, origin, choice, sample_2d(index, lamps.seed, TRANSFER_POINT_DIMENSION))
-        cosine = wp.dot(e.direction, n)
-        if e.pdf > 0.0 and cosine > 0.0 and wp.dot(e.direction, s.normal) > 0.0:
-            if bvh_occluded(lamps.bvh, origin, e.direction, e.distance * SHADOW_END) == 0:
-                if e.delta == 0:
-                    cosine = cosine / e.pdf * balance(e.pdf, cosine / wp.pi)
-                sum += e.radiance * cosine
+        drawn = sample_emitter(scene, origin, choice, sample_2d(index, lamps.seed, TRANSFER_POINT_DIMENSION))
+        cosine = wp.dot(drawn.direction, n)
+        if drawn.pdf > 0.0 and cosine > 0.0 and wp.dot(drawn.direction, s.normal) > 0.0:
+            if bvh_occluded(lamps.bvh, origin, drawn.direction, drawn.distance * SHADOW_END) == 0:
+                if drawn.delta == 0:
+                    cosine = cosine / drawn.pdf * balance(drawn.pdf, cosine / wp.pi)
+                sum += drawn.radiance * cosine
         if lamps.each == 0:
             local = cosine_direction(sample_2d(index, lamps.seed, TRANSFER_RAY_DIMENSION))
             direction = s.shading * local

@@ -55,7 +55,8 @@ def reflect_slots(
         normal = -normal
     m = scene.materials[scene.geometry.materials[face]]
     side = int(1)
-    if m.base_color_texture >= 0 or m.metallic_roughness_texture >= 0:
+    textures = wp.max(m.base_color_texture, wp.max(m.metallic_roughness_texture, m.specular_texture))
+    if textures >= 0 or m.reflectance_texture >= 0 or scene.geometry.colors.shape[0] > 0:
         side = FOOTPRINT
     steps = texel_steps(atlas, face)
     sum = wp.vec3()

@@ -81,15 +81,15 @@ def in_plane(n: wp.vec3, view: wp.vec3, sine: wp.float32, cosine: wp.float32) ->
 @wp.func
 def lobe_at(table: LobeTable, at: TablePlace, n: wp.vec3, view: wp.vec3) -> Lobe:
     r = Lobe()
-    e = table.entries
-    order = e.shape[2] - HEAD - NORMAL_BANDS
-    side = wp.vec2(table_entry(e, at, 0), table_entry(e, at, 1))
+    entries = table.entries
+    order = entries.shape[2] - HEAD - NORMAL_BANDS
+    side = wp.vec2(table_entry(entries, at, 0), table_entry(entries, at, 1))
     side = side / wp.length(side)
     r.direction = in_plane(n, view, side[0], side[1])
     for l in range(order):
-        r.factors[l] = table_entry(e, at, HEAD + l)
+        r.factors[l] = table_entry(entries, at, HEAD + l)
     for l in range(NORMAL_BANDS):
-        r.normal_factors[l] = table_entry(e, at, HEAD + order + l)
+        r.normal_factors[l] = table_entry(entries, at, HEAD + order + l)
     c = side[1]
     c2 = c * c
     f = r.factors

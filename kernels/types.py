@@ -30,6 +30,11 @@ class Texture:
     wrap_u: wp.int32  # WRAP_*
     wrap_v: wp.int32
     srgb: wp.int32  # 1: red, green, blue are sRGB-coded; alpha never is
+    nearest: wp.int32  # 1: the nearest texel, else bilinear
+    uv_set: wp.int32  # 0: Geometry.uvs, 1: Geometry.further_uvs
+    moved: wp.int32  # 1: the set is not 0, or coordinates are (dot(to_u, (u, v, 1)), dot(to_v, (u, v, 1)))
+    to_u: wp.vec3
+    to_v: wp.vec3
 
 
 # glTF 2.0 metallic-roughness. Texture fields index SceneData.textures.
@@ -40,6 +45,7 @@ class Material:
     metallic: wp.float32
     roughness: wp.float32  # perceptual; GGX alpha is its square
     specular: wp.float32  # KHR_materials_specular factor; 0 is pure Lambert
+    reflectance: wp.vec3  # of the coat at normal incidence, before the factor; 0.04 is usual
     normal_scale: wp.float32
     emission: wp.vec3  # radiance
     alpha_cutoff: wp.float32  # negative: opaque
@@ -48,6 +54,9 @@ class Material:
     metallic_roughness_texture: wp.int32  # G roughness, B metallic
     normal_texture: wp.int32  # tangent space, x right, y up
     emission_texture: wp.int32
+    specular_texture: wp.int32  # A factor on specular
+    reflectance_texture: wp.int32  # RGB factor on reflectance
+    colors_emit: wp.int32  # 1: colours of vertices multiply the emission, too
 
 
 # Triangles in world space, at the current and at the previous frame.
@@ -57,6 +66,8 @@ class Geometry:
     previous_points: wp.array(dtype=wp.vec3)  # [vertex]
     normals: wp.array(dtype=wp.vec3)  # [vertex] unit, or zero for flat shading
     uvs: wp.array(dtype=wp.vec2)  # [vertex]
+    further_uvs: wp.array(dtype=wp.vec2)  # [vertex] second set, empty where no texture asks for it
+    colors: wp.array(dtype=wp.vec4)  # [vertex] linear, multiplied with base colour and coverage; empty if all are 1
     indices: wp.array(dtype=wp.vec3i)  # [triangle]
     materials: wp.array(dtype=wp.int32)  # [triangle]
     objects: wp.array(dtype=wp.int32)  # [triangle]
@@ -132,6 +143,7 @@ class Bvh:
     masks: wp.array(dtype=AlphaMask)
     indices: wp.array(dtype=wp.vec3i)  # [triangle] for uvs; empty where all are opaque
     uvs: wp.array(dtype=wp.vec2)  # [vertex]
+    alphas: wp.array(dtype=wp.float32)  # [vertex] coverage, multiplied with the texture's; empty if all are 1
     textures: wp.array(dtype=Texture)
     texels: wp.array(dtype=wp.uint32)  # RGBA8
 

@@ -142,7 +142,8 @@ def hinted_occluded(bvh: Bvh, query: FieldQuery, key: wp.int32, origin: wp.vec3,
     return found != 0
 
 
-_LANES = """
+# Eight lanes of native code at once, or one after the other on CUDA.
+LANES = """
 #if defined(__CUDA_ARCH__)
     typedef float F;
     typedef int I;
@@ -169,7 +170,7 @@ _LANES = """
 #endif
     #define ABS(x) ((x) < 0.0f ? -(x) : (x))
 """
-_END = """
+LANES_END = """
     #undef TO_F
     #undef TO_I
     #undef ROOT
@@ -181,11 +182,47 @@ _END = """
 """
 
 
+# Texels of the directions x, y, z, into `result`, and which of them are known to be visible or occluded.
+OCTET_TEXELS = """
+        // octahedral_encode and octahedral_texel
+        const float half = 0.5f * (float)grid.resolution;
+        const F scale = half / (ABS(x) + ABS(y) + ABS(z));
+        const F px = x * scale, pz = z * scale;
+        const F fx = half - ABS(pz), fz = half - ABS(px);
+        const F column = half + (y < 0.0f ? (x < 0.0f ? -fx : fx) : px);
+        const F row = half + (y < 0.0f ? (z < 0.0f ? -fz : fz) : pz);
+        const int last = grid.resolution - 1;
+        I i = TO_I(column), j = TO_I(row);
+        i = i > last ? last + (i & 0) : i;
+        j = j > last ? last + (j & 0) : j;
+        i = i < 0 ? (i & 0) : i;
+        j = j < 0 ? (j & 0) : j;
+        const I texel = j * grid.resolution + i;
+        const F number = TO_F(texel);
+        COPY(&result.c[24 + lane], &number, sizeof(F));
+        if (slot >= 0) {
+            const unsigned* map = grid.masks.data + (long long)(slot & 0x1fffffff) * grid.words;
+            const I word = texel >> 4;
+            U state;
+#if defined(__CUDA_ARCH__)
+            state = map[word] >> (U)(2 * (texel & 15));
+            visible |= (state & 1u) << lane;
+            occluded |= ((state >> 1) & 1u) << lane;
+#else
+            for (int k = 0; k < 8; ++k) state[k] = map[word[k]];
+            state >>= (U)(2 * (texel & 15));
+            visible = __builtin_bit_cast(unsigned char, __builtin_convertvector((state & 1u) != 0, B8));
+            occluded = __builtin_bit_cast(unsigned char, __builtin_convertvector((state & 2u) != 0, B8));
+#endif
+        }
+"""
+
+
 # Eight cosine-weighted rays, from number `start` of the sets on, turned by `frame`: x, y and z of their directions,
 # their texels (as floats), and, as the bits of the last float, which are visible (bits 0 to 7), occluded (8 to 15),
 # and above the plane of `normal` (16 to 23).
 @wp.func_native(
-    _LANES
+    LANES
     + """
     wp::vec_t<33, float> result;
     const float* sets = cosines.data + start;
@@ -203,49 +240,21 @@ _END = """
         COPY(&result.c[lane], &x, sizeof(F));
         COPY(&result.c[8 + lane], &y, sizeof(F));
         COPY(&result.c[16 + lane], &z, sizeof(F));
-        // octahedral_encode and octahedral_texel
-        const float half = 0.5f * (float)grid.resolution;
-        const F scale = half / (ABS(x) + ABS(y) + ABS(z));
-        const F px = x * scale, pz = z * scale;
-        const F fx = half - ABS(pz), fz = half - ABS(px);
-        const F column = half + (y < 0.0f ? (x < 0.0f ? -fx : fx) : px);
-        const F row = half + (y < 0.0f ? (z < 0.0f ? -fz : fz) : pz);
-        const int last = grid.resolution - 1;
-        I i = TO_I(column), j = TO_I(row);
-        i = i > last ? last + (i & 0) : i;
-        j = j > last ? last + (j & 0) : j;
-        i = i < 0 ? (i & 0) : i;
-        j = j < 0 ? (j & 0) : j;
-        const I texel = j * grid.resolution + i;
-        const F number = TO_F(texel);
-        COPY(&result.c[24 + lane], &number, sizeof(F));
+"""
+    + OCTET_TEXELS
+    + """
         const F height = x * normal[0] + y * normal[1] + z * normal[2];
 #if defined(__CUDA_ARCH__)
         above |= (unsigned)(height > 0.0f) << lane;
 #else
         above = __builtin_bit_cast(unsigned char, __builtin_convertvector(height > 0.0f, B8));
 #endif
-        if (slot >= 0) {
-            const unsigned* map = grid.masks.data + (long long)(slot & 0x1fffffff) * grid.words;
-            const I word = texel >> 4;
-            U state;
-#if defined(__CUDA_ARCH__)
-            state = map[word] >> (U)(2 * (texel & 15));
-            visible |= (state & 1u) << lane;
-            occluded |= ((state >> 1) & 1u) << lane;
-#else
-            for (int k = 0; k < 8; ++k) state[k] = map[word[k]];
-            state >>= (U)(2 * (texel & 15));
-            visible = __builtin_bit_cast(unsigned char, __builtin_convertvector((state & 1u) != 0, B8));
-            occluded = __builtin_bit_cast(unsigned char, __builtin_convertvector((state & 2u) != 0, B8));
-#endif
-        }
     }
     const unsigned bits = visible | occluded << 8 | above << 16;
     COPY(&result.c[32], &bits, 4);
     return result;
 """
-    + _END
+    + LANES_END
 )
 def cosine_octet(
     grid: VisibilityGrid,
@@ -260,7 +269,7 @@ def cosine_octet(
 # Sums over the octet's rays in `bits` of the light of a low-frequency sky (rows of `sky`: nine coefficients each of
 # red, green and blue): radiance, then its squares.
 @wp.func_native(
-    _LANES
+    LANES
     + """
     wp::vec_t<6, float> result;
     for (int lane = 0; lane < 8; lane += lanes) {
@@ -288,7 +297,7 @@ def cosine_octet(
     }
     return result;
 """
-    + _END
+    + LANES_END
 )
 def harmonic_light(sky: wp.types.matrix(shape=(3, 9), dtype=wp.float32), octet: vec33, bits: wp.int32) -> vec6: ...
 

@@ -13,7 +13,7 @@ order that they are read, with their radiance beside them.
 
 import warp as wp
 
-from warp_gi.kernels.bsdf import bsdf_evaluate, bsdf_sample, bsdf_weight
+from warp_gi.kernels.bsdf import bsdf_evaluate, specular_probability
 from warp_gi.kernels.bvh import bvh_occluded
 from warp_gi.kernels.environment import environment_arrival, environment_lookup, environment_sample
 from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, tiled_pixel
@@ -26,9 +26,11 @@ from warp_gi.kernels.sampling import (
     SET_SKY_DIGITS_DIMENSION,
     SET_SKY_DIMENSION,
     morton_code,
+    pair_keys,
     pixel_sample_index,
     pixel_seed,
     random_1d,
+    random_key,
     sample_2d,
 )
 from warp_gi.kernels.surface import Surface, ray_origin, shading_normal, surface_shape, with_color
@@ -57,6 +59,14 @@ from warp_gi.kernels.visibility_field import (
     texel_state,
     turned_frame,
     vec33,
+)
+from warp_gi.kernels.visibility_field_lobes import (
+    glossy_octet,
+    octet_pdf,
+    octet_sums,
+    octet_weight,
+    octet_weights,
+    vec32,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -206,8 +216,8 @@ def occluded_lanes(scene: SceneData, p: FieldPixel, octet: vec33, bits: wp.int32
 @wp.func
 def weighted_sky(scene: SceneData, sky: FieldSky, direction: wp.vec3, pdf: wp.float32) -> wp.vec3:
     if sky.kind == SKY_MAP:
-        e = environment_lookup(scene.environment, direction)
-        return e.radiance * (pdf / (pdf + e.pdf))
+        beyond = environment_lookup(scene.environment, direction)
+        return beyond.radiance * (pdf / (pdf + beyond.pdf))
     if sky.kind == SKY_HARMONIC:
         return sky.harmonics * harmonics(direction)
     return sky.radiance
@@ -277,15 +287,27 @@ def lambert_samples(
         above = (bits >> 16) & lanes
         visible = bits & above
         occluded = (bits >> 8) & above
+        sure = int(0)
+        verified = int(0)
+        todo = int(above)
         if query.mode == MODE_PAPER:
-            todo = int(above)  # a cell without samples traces all
-            if p.slot >= 0:
+            if p.slot >= 0:  # a cell without samples traces all
                 todo = visible
             if subtracts:
                 todo = occluded
                 if (p.slot & SLOT_BOXED) != 0:
                     todo = todo | boxed_lanes(query, p, octet, above & ~occluded)
-            blocked = occluded_lanes(scene, p, octet, todo)
+        else:
+            sure = visible ^ occluded
+            if (p.slot & SLOT_BOXED) != 0 and p.slot >= 0:
+                sure = sure & ~boxed_lanes(query, p, octet, sure & visible)
+            if query.mode == MODE_UNBIASED:
+                verified = verified_lanes(query, p, sure, start)
+            todo = (above & ~sure) | verified
+        blocked = int(0)
+        if todo != 0:
+            blocked = occluded_lanes(scene, p, octet, todo)  # one call, which is inlined: two are not
+        if query.mode == MODE_PAPER:
             if subtracts:
                 gone = blocked | (lanes & ~above)
                 sums = add_lanes(scene, sky, octet, gone, -1.0, normal, sums)
@@ -296,16 +318,6 @@ def lambert_samples(
                 if transfer.shape[0] > 0:
                     t = add_transfer(t, octet, todo & ~blocked, 1.0)
         else:
-            sure = visible ^ occluded
-            if (p.slot & SLOT_BOXED) != 0 and p.slot >= 0:
-                sure = sure & ~boxed_lanes(query, p, octet, sure & visible)
-            verified = int(0)
-            if query.mode == MODE_UNBIASED:
-                verified = verified_lanes(query, p, sure, start)
-            todo = (above & ~sure) | verified
-            blocked = int(0)
-            if todo != 0:
-                blocked = occluded_lanes(scene, p, octet, todo)
             leaked = verified & visible & blocked
             lost = verified & ~visible & ~blocked
             seen = ((sure & visible) & ~leaked) | (todo & ~verified & ~blocked)
@@ -331,7 +343,84 @@ def lambert_samples(
     return sums
 
 
-# BSDF samples of any surface, one at a time.
+# Adds to `sums` the light of the lanes in `bits` times `factor`, by weights of the BSDF.
+@wp.func
+def add_weighted(
+    scene: SceneData, sky: FieldSky, octet: vec33, weights: vec32, bits: wp.int32, factor: wp.float32, sums: FieldSums
+) -> FieldSums:
+    r = sums
+    if sky.kind == SKY_CONSTANT:
+        of = octet_sums(weights, bits)
+        light = sky.radiance * factor
+        r.bsdf = r.bsdf + wp.cw_mul(light, wp.vec3(of[0], of[1], of[2]))
+        r.bsdf_square = r.bsdf_square + wp.cw_mul(wp.cw_mul(light, light), wp.vec3(of[3], of[4], of[5]))
+    else:
+        todo = int(bits)
+        while todo != 0:
+            lane = lowest_bit(todo)
+            todo = todo & (todo - 1)
+            arrives = weighted_sky(scene, sky, octet_direction(octet, lane), octet_pdf(weights, lane))
+            light = wp.cw_mul(octet_weight(weights, lane), arrives) * factor
+            r.bsdf = r.bsdf + light
+            r.bsdf_square = r.bsdf_square + wp.cw_mul(light, light)
+    return r
+
+
+# Adds what the lanes in `bits` bring of each harmonic of a sky to a pixel's transfers.
+@wp.func
+def add_weighted_transfer(
+    transfer: wp.array(dtype=wp.float32),
+    index: wp.int32,
+    octet: vec33,
+    weights: vec32,
+    bits: wp.int32,
+    factor: wp.float32,
+):
+    todo = int(bits)
+    while todo != 0:
+        lane = lowest_bit(todo)
+        todo = todo & (todo - 1)
+        y = harmonics(octet_direction(octet, lane)) * factor
+        weight = octet_weight(weights, lane)
+        for channel in range(3):
+            for i in range(9):
+                at = index * 27 + channel * 9 + i
+                transfer[at] = transfer[at] + y[i] * weight[channel]
+
+
+# Lanes of a glossy octet whose light arrives: as it is (bits 0 to 7), as 1 - 1 / verify of it (8 to 15), and as
+# 1 / verify of it (16 to 23). The field is asked as sure_visibility does.
+@wp.func
+def lit_lanes(
+    scene: SceneData, query: FieldQuery, p: FieldPixel, octet: vec33, lanes: wp.int32, start: wp.int32
+) -> wp.int32:
+    bits = octet_bits(octet)
+    above = (bits >> 16) & lanes
+    visible = bits & above
+    occluded = (bits >> 8) & above
+    sure = int(0)
+    verified = int(0)
+    todo = int(above)
+    if query.mode == MODE_PAPER:
+        if p.slot >= 0:
+            todo = visible
+    else:
+        sure = visible ^ occluded
+        if (p.slot & SLOT_BOXED) != 0 and p.slot >= 0:
+            sure = sure & ~boxed_lanes(query, p, octet, sure & visible)
+        if query.mode == MODE_UNBIASED:
+            verified = verified_lanes(query, p, sure, start)
+        todo = (above & ~sure) | verified
+    blocked = int(0)
+    if todo != 0:
+        blocked = occluded_lanes(scene, p, octet, todo)
+    leaked = verified & visible & blocked
+    lost = verified & ~visible & ~blocked
+    seen = ((sure & visible) & ~leaked) | (todo & ~verified & ~blocked)
+    return seen | (leaked << 8) | (lost << 16)
+
+
+# BSDF samples of any surface, eight at a time.
 @wp.func
 def glossy_samples(
     scene: SceneData,
@@ -344,24 +433,32 @@ def glossy_samples(
     transfer: wp.array(dtype=wp.float32),
 ) -> FieldSums:
     sums = FieldSums()
-    for sample in range(p.first, p.first + p.count):
-        lobe = random_1d(wp.uint32(sample), p.seed, FIELD_LOBE_DIMENSION)
-        u = sample_2d(p.index_base + wp.uint32(sample), p.index_seed, FIELD_BSDF_DIMENSION)
-        b = bsdf_sample(s.bsdf, wo, lobe, u)
-        direction = s.shading * b.wi
-        if b.pdf > 0.0 and wp.dot(direction, s.normal) > 0.0:
-            passed = sky_visibility(scene, grid, query, p, direction, sample, FIELD_BSDF_DIMENSION)
-            if passed != 0.0:
-                weight = bsdf_weight(s.bsdf, b) * passed
-                light = wp.cw_mul(weight, weighted_sky(scene, sky, direction, b.pdf))
-                sums.bsdf = sums.bsdf + light
-                sums.bsdf_square = sums.bsdf_square + wp.cw_mul(light, light)
+    if wo[2] <= 0.0:
+        return sums
+    specular = specular_probability(s.bsdf, wo[2])
+    keys = pair_keys(p.index_seed, FIELD_BSDF_DIMENSION)
+    lobe = random_key(p.seed, FIELD_LOBE_DIMENSION)
+    for done in range(0, p.count, 8):
+        start = p.first + done
+        index = p.index_base + wp.uint32(start)
+        octet = glossy_octet(grid, p.slot, s.bsdf, specular, wo, s.shading, s.normal, keys, index, lobe, start)
+        lanes = int(255)
+        if p.count - done < 8:
+            lanes = (1 << (p.count - done)) - 1
+        lit = lit_lanes(scene, query, p, octet, lanes, start)
+        if lit != 0:
+            weights = octet_weights(octet, s.bsdf, specular, wo, s.shading)
+            sums = add_weighted(scene, sky, octet, weights, lit & 255, 1.0, sums)
+            if transfer.shape[0] > 0:
+                add_weighted_transfer(transfer, p.index, octet, weights, lit & 255, 1.0)
+            if lit > 255:
+                leaked = (lit >> 8) & 255
+                lost = lit >> 16
+                sums = add_weighted(scene, sky, octet, weights, leaked, 1.0 - 1.0 / query.verify, sums)
+                sums = add_weighted(scene, sky, octet, weights, lost, 1.0 / query.verify, sums)
                 if transfer.shape[0] > 0:
-                    y = harmonics(direction)
-                    for channel in range(3):
-                        for i in range(9):
-                            at = p.index * 27 + channel * 9 + i
-                            transfer[at] = transfer[at] + y[i] * weight[channel]
+                    add_weighted_transfer(transfer, p.index, octet, weights, leaked, 1.0 - 1.0 / query.verify)
+                    add_weighted_transfer(transfer, p.index, octet, weights, lost, 1.0 / query.verify)
     return sums
 
 
@@ -456,9 +553,9 @@ def sample_sky(first: wp.int32, scene: SceneData, seed: wp.uint32, sky: FieldSky
     k = first + wp.tid()
     u = sample_2d(wp.uint32(k), seed, SET_SKY_DIMENSION)
     digits = random_1d(wp.uint32(k), seed, SET_SKY_DIGITS_DIMENSION)
-    e = environment_sample(scene.environment, wp.vec3(u[0], u[1], digits))
-    source = environment_arrival(scene.environment, e)
-    sky.directions[k] = e.direction
+    drawn = environment_sample(scene.environment, wp.vec3(u[0], u[1], digits))
+    source = environment_arrival(scene.environment, drawn)
+    sky.directions[k] = drawn.direction
     sky.pdfs[k] = source.pdf
     sky.radiances[k] = source.radiance
 

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import warp as wp
 
 import warp_gi
 
@@ -76,6 +77,21 @@ def test_kernels_keep_their_form(path):
             assert lines[above].strip().startswith("#"), f"{node.name}: say what a thread is, above the decorator"
 
 
+@pytest.mark.parametrize("path", KERNELS, ids=_relative)
+def test_locals_of_device_code_are_not_named_as_constants_of_warp(path):
+    """Warp takes `e.pdf` for Euler's number until `e` was compiled: a hash then depends on what was compiled before."""
+    for function in ast.walk(ast.parse(path.read_text())):
+        if not isinstance(function, ast.FunctionDef):
+            continue
+        stored = {n.id for n in ast.walk(function) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+        read = {
+            n.value.id for n in ast.walk(function) if isinstance(n, ast.Attribute) and isinstance(n.value, ast.Name)
+        }
+        own = (stored | {argument.arg for argument in function.args.args}) & read
+        taken = {name for name in own if isinstance(getattr(wp, name, None), (int, float))}
+        assert not taken, f"{function.name}: rename {taken}"
+
+
 @pytest.mark.parametrize("name", warp_gi.__all__)
 def test_public_names_are_there_and_documented(name):
     value = getattr(warp_gi, name)
@@ -94,7 +110,7 @@ def test_import_is_light_and_compiles_nothing():
 import sys, warp
 before = set(sys.modules)
 import warp_gi
-heavy = {"trimesh", "OpenImageIO", "rich", "tyro", "PIL", "pygltflib", "scipy"}
+heavy = {"trimesh", "OpenImageIO", "OpenEXR", "rich", "tyro", "PIL", "pygltflib", "scipy"}
 print(sorted({name.partition(".")[0] for name in set(sys.modules) - before} & heavy))
 print(sorted(name for name in sys.modules if name.startswith("warp_gi.")))
 print(warp._src.context.runtime is None)

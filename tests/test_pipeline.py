@@ -1,6 +1,7 @@
 """Pipeline, scheduler and frame: settings, buffers, motion, determinism."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,9 +9,14 @@ import warp as wp
 from scene_tools import card, sphere
 
 import warp_gi as gi
+import warp_gi.frame
+import warp_gi.launch
+import warp_gi.scheduler
 from warp_gi.errors import OptionError
+from warp_gi.frame import timed
 from warp_gi.kernels.sampling import random_1d
-from warp_gi.launch import set_threads
+from warp_gi.launch import get_device, set_threads
+from warp_gi.scheduler import FrameScheduler
 
 SIZE = (24, 16)
 
@@ -195,6 +201,45 @@ def test_metadata_and_timings_tell_how_it_was_made():
     assert len(frame.metadata["scene_hash"]) == 64
     assert {"bake", "compile", "scene", "primary", "paths", "compose"} <= set(frame.timings)
     assert all(seconds >= 0 for seconds in frame.timings.values())
+
+
+@pytest.mark.parametrize("preset", ["clean", "reuse", "dvf"])
+def test_stages_add_up_and_leave_no_launch_out(monkeypatch, preset):
+    """By a clock that ticks at each launch alone: no launch is in two stages, or in none."""
+    ticks, run = [0], wp.launch
+
+    def launch_and_tick(*arguments, **settings):
+        ticks[0] += 1
+        return run(*arguments, **settings)
+
+    scheduler = FrameScheduler(lit_scene(), gi.CameraPath.still(camera()), gi.Pipeline.preset(preset, spp=1))
+    set_threads(1)
+    try:
+        scheduler.frame(0)
+        monkeypatch.setattr(wp, "launch", launch_and_tick)
+        for module in (warp_gi.scheduler, warp_gi.frame, warp_gi.launch):
+            monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: ticks[0], process_time=lambda: 0))
+        for index in (1, 2):
+            before = ticks[0]
+            timings = scheduler.frame(index).timings
+            del timings["bake"]
+            assert sum(timings.values()) == ticks[0] - before > 5
+            assert timings["scheduler"] == 0 and timings["compile"] == 0
+    finally:
+        set_threads(None)
+
+
+def test_a_stage_within_another_counts_once(monkeypatch):
+    now, timings = [0.0], {}
+    monkeypatch.setattr(warp_gi.frame, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    device = get_device("cpu")
+    with timed(timings, "outer", device):
+        now[0] += 1
+        with timed(timings, "inner", device):
+            now[0] += 3
+            monkeypatch.setattr(warp_gi.launch, "compile_seconds", warp_gi.launch.compile_seconds + 2)
+        now[0] += 4
+    assert timings == pytest.approx({"outer": 5, "inner": 1, "compile": 2})
 
 
 def test_a_scene_without_light_is_black():

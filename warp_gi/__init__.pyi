@@ -17,6 +17,7 @@ from warp_gi.errors import BakeError as BakeError
 from warp_gi.errors import GiError as GiError
 from warp_gi.errors import OptionError as OptionError
 from warp_gi.errors import SceneError as SceneError
+from warp_gi.errors import UnsupportedWarning as UnsupportedWarning
 from warp_gi.estimator import Estimator as Estimator
 from warp_gi.frame import Frame as Frame
 from warp_gi.launch import set_threads as set_threads

@@ -39,6 +39,8 @@ class AlphaMasks:
     """Textures that masks look up, kernels.types.Texture [texture], on the tree's device."""
     texels: wp.array
     """Texels of all textures, uint32 RGBA8 [texel] with red in the low byte, on the tree's device."""
+    alphas: np.ndarray | None = None
+    """Coverage of vertices, multiplied with that of textures, float32 [vertex]; None is 1."""
 
 
 @dataclass(eq=False)
@@ -177,6 +179,8 @@ class TriangleBvh:
         self.data.face_masks = wp.array(face_mask, dtype=wp.int32, device=self.device)
         self.data.masks = wp.array(masks, dtype=types.AlphaMask, device=self.device)
         self.data.uvs = wp.array(uvs, dtype=wp.vec2, device=self.device)
+        if alpha.alphas is not None:
+            self.data.alphas = wp.array(np.asarray(alpha.alphas, np.float32), dtype=wp.float32, device=self.device)
         self.data.indices = self._indices
         self.data.textures = alpha.textures
         self.data.texels = alpha.texels

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -13,7 +13,8 @@ import warp as wp
 
 from warp_gi import launch
 from warp_gi.errors import OptionError, check_whole, one_line, unknown_name
-from warp_gi.kernels import denoise, denoise_edges
+from warp_gi.kernels import apart_lights, denoise, denoise_apart, denoise_edges
+from warp_gi.scene.apart import ApartLights, has_apart_lights
 from warp_gi.stateful import Ahead, Stateful
 
 if TYPE_CHECKING:
@@ -43,6 +44,11 @@ class Denoiser(Stateful):
     wants_lobes: ClassVar[bool] = False
     """Whether ``apply`` reads the guides and the separated light (``Frame.lobes``)."""
 
+    @property
+    def parts_lights(self) -> bool:
+        """Whether it wants the diffuse light of suns and of lights without size apart (``Lobes.apart``)."""
+        return False
+
     def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
         """Return whether a frame depends on those before it; True, unless a denoiser promises that it does not."""
         return True
@@ -61,6 +67,16 @@ class Denoiser(Stateful):
 
 
 @dataclass(frozen=True)
+class ApartHistory:
+    """What ``SpatioTemporal`` keeps of the light of suns and of lights without size."""
+
+    average: wp.array
+    """Light and the number of frames in it, vec4 [height * width]."""
+    directions: np.ndarray
+    """Unit directions towards the suns, float64 [suns, 3]."""
+
+
+@dataclass(frozen=True)
 class History:
     """State of ``SpatioTemporal``: what it keeps of the last frame."""
 
@@ -74,8 +90,10 @@ class History:
     """Geometry and colours of the surfaces in the frame's pixels."""
     average: denoise.Signals
     """Averages over frames of diffuse and glossy light, and the number of frames in them."""
+    apart: ApartHistory | None = None
+    """Diffuse light of lights that are apart, if there are any."""
     picture: wp.array | None = None
-    """The frame's beauty, vec3 [height * width], if pictures are averaged."""
+    """Average of the reflected light of pictures, vec3 [height * width], if pictures are averaged."""
 
     @staticmethod
     def empty(scene: Scene | BakedScene, device: wp.Device) -> History:
@@ -87,10 +105,13 @@ class History:
         parts = {f"{name}": getattr(self.guides, name) for name in READ_GUIDES}
         parts |= {name: getattr(self.average, name) for name in launch.fields_of(denoise.Signals)}
         parts |= {} if self.picture is None else {"picture": self.picture}
+        parts |= {} if self.apart is None else {"apart": self.apart.average}
         frame = {
             "frame": np.array([self.index, *self.resolution]),
             "light": np.frombuffer(self.scene[1].encode(), np.uint8),
         }
+        if self.apart is not None:
+            frame["apart_directions"] = self.apart.directions
         return frame | {name: array.numpy() for name, array in parts.items()}
 
     def with_saved_arrays(self, arrays: Mapping[str, np.ndarray]) -> History:
@@ -102,12 +123,15 @@ class History:
             *((guides, n) for n in READ_GUIDES),
             *((average, n) for n in launch.fields_of(denoise.Signals)),
         ]:
-            setattr(struct, name, _loaded(arrays[name], getattr(struct, name), size[0] * size[1]))
-        picture = None
+            setattr(struct, name, _loaded(arrays[name], getattr(struct, name).dtype, size[0] * size[1], device))
+        picture, apart = None, None
         if "picture" in arrays:
-            picture = _loaded(arrays["picture"], average.diffuse, size[0] * size[1])
+            picture = _loaded(arrays["picture"], wp.vec3, size[0] * size[1], device)
+        if "apart" in arrays:
+            lights = _loaded(arrays["apart"], wp.vec4, size[0] * size[1], device)
+            apart = ApartHistory(lights, arrays["apart_directions"].reshape(-1, 3))
         light = arrays["light"].tobytes().decode("ascii")
-        return History(index, (size[0], size[1]), (self.scene[0], light), guides, average, picture)
+        return History(index, (size[0], size[1]), (self.scene[0], light), guides, average, apart, picture)
 
     def leads_to(self, frame: Frame) -> bool:
         """Return whether the frame's motion is towards the last frame, of the same scene and size."""
@@ -126,16 +150,16 @@ READ_GUIDES = ("guide_object", "guide_normal", "guide_position")
 def _empty(struct: type[launch.Struct], device: wp.Device) -> launch.Struct:
     """Return a kernel struct whose arrays have no items."""
     empty = struct()
-    for name, field in struct.vars.items():  # type: ignore[attr-defined]
-        setattr(empty, name, wp.empty(0, dtype=field.type.dtype, device=device))
+    for name, variable in struct.vars.items():  # type: ignore[attr-defined]
+        setattr(empty, name, wp.empty(0, dtype=variable.type.dtype, device=device))
     return empty
 
 
-def _loaded(array: np.ndarray, like: wp.array, count: int) -> wp.array:
-    """Return an array on the device of another one, with its type; raises ValueError unless it has ``count`` items."""
+def _loaded(array: np.ndarray, dtype: type, count: int, device: wp.Device) -> wp.array:
+    """Return an array on a device; raises ValueError unless it has ``count`` items."""
     if len(array) != count:
         raise ValueError(f"{len(array)} pixels instead of {count}")
-    return wp.array(array, dtype=like.dtype, device=like.device)
+    return wp.array(array, dtype=dtype, device=device)
 
 
 def light_of(scene: Scene | BakedScene) -> str:
@@ -181,17 +205,23 @@ class SpatioTemporal(Denoiser):
     first_samples: int = 4
     """Samples a pixel, at least, of a frame without a frame before, 1 to 65536: the first one, a still, or after a cut.
     There is no average yet that would make up for few."""
+    apart_frames: int = 4
+    """Most frames in the average of diffuse light from small suns of a sky, and from lights without size if there are
+    at most four and no emissive surfaces; 1 to 1024. Each gets a ray of its own, and its shadows are not filtered
+    over pixels. 0 leaves it in other light."""
     edge_samples: int = 4
-    """Camera samples of a pixel whose neighbours show something else, 0 to 64. They share the light of the pixels
-    around, and cost no light samples. 0 takes none, and so do frames with as many camera samples in each pixel."""
-    blend: float = 1.0
-    """Weight of a frame in the average of pictures, above 0 to 1 (temporal antialiasing): 0.25 flickers less and is
-    softer; 1 is no average."""
+    """Camera samples of a pixel whose neighbours show something else, its own among them, 0 to 64. They share the light
+    of the pixels around, and cost no light samples. Where neighbours are of one surface and only their colours differ,
+    two thirds of the further samples are taken. Frames that have as many in each pixel take no more."""
+    blend: float = 0.25
+    """Weight of a frame in the average of pictures, above 0 to 1 (temporal antialiasing). Smaller ones flicker less and
+    are softer; 1 is no average."""
 
     def validate(self) -> None:
         """Raise OptionError for settings out of range."""
         check_whole("first_samples", self.first_samples, 1, 1 << 16)
         check_whole("edge_samples", self.edge_samples, 0, 64)
+        check_whole("apart_frames", self.apart_frames, 0, 1024)
         if not 0 < self.blend <= 1:
             raise OptionError(f"blend must be a weight above 0 and at most 1, got {self.blend}")
         for name in ("frames", "glossy_frames"):
@@ -205,9 +235,27 @@ class SpatioTemporal(Denoiser):
             raise OptionError(f"lag must be 0 or a number of deviations above it, got {self.lag}")
 
     @property
+    def parts_lights(self) -> bool:
+        """Whether there is an average of light that is apart."""
+        return self.apart_frames > 0
+
+    @property
     def saves_state(self) -> bool:
         """True: a file holds what the next frame reads, some 70 bytes a pixel."""
         return True
+
+    def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
+        """Return the kernels of the filter, of edges, and of light that is apart."""
+        edges = (denoise_edges.sample_edges,) if self.edge_samples or self.blend < 1 else ()
+        apart = (denoise_apart.average_apart,) if self.samplers(scene) else ()
+        return (denoise.separate_light, *edges, *apart)
+
+    def samplers(self, scene: Scene | BakedScene | None = None) -> tuple[Any, ...] | None:
+        """Return the lights that paths keep apart, if the scene has any."""
+        if scene is None and self.parts_lights:
+            return None
+        is_parted = scene is not None and self.parts_lights and has_apart_lights(scene)
+        return (apart_lights.APART_LIGHTS,) if is_parted else ()
 
     def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> History:
         """Return a history of no frame."""
@@ -220,25 +268,19 @@ class SpatioTemporal(Denoiser):
 
     def apply(self, frame: Frame, state: History) -> History:
         """Fill ``frame["beauty"]``; the state is the last frame's History."""
-        light, guides = frame.struct(denoise.NoisyLight), frame.struct(denoise.Guides)
+        light, guides, changes = frame.struct(denoise.NoisyLight), frame.struct(denoise.Guides), None
         settings, average = self._settings(frame), self._signals(frame)
         frame.launch(denoise.separate_light, [settings, light, guides, average])
         has_history = state.leads_to(frame)
         if has_history:
-            average = self._accumulated(frame, settings, state, guides, average)
+            average, changes = self._accumulated(frame, settings, state, guides, average)
         filtered = self._filtered(frame, settings, guides, average, 0 if has_history else 1)
+        apart = self._apart(frame, settings, state if has_history else None, guides, filtered)
         frame.launch(denoise.put_back, [light, guides, filtered, frame["beauty"]])
-        edges = self._edges(frame)
-        if edges.samples > 0:
-            inputs = [frame.seen_data, frame.camera_data, settings, edges, guides, filtered, frame["beauty"]]
-            frame.launch_tiled(denoise_edges.sample_edges, inputs)
-        if has_history and state.picture is not None:
-            picture = wp.clone(frame["beauty"])
-            inputs = [settings, edges, frame["depth"], frame["motion"], picture, state.picture, frame["beauty"]]
-            frame.launch(denoise_edges.average_pictures, inputs)
+        last = state.picture if has_history else None
+        picture = self._finished(frame, settings, guides, filtered, changes, last)
         scene = (frame.scene, light_of(frame.scene))
-        kept = wp.clone(frame["beauty"]) if self.blend < 1 else None  # whoever has the frame may write to it
-        return History(frame.index, frame.camera.resolution, scene, guides, average, kept)
+        return History(frame.index, frame.camera.resolution, scene, guides, average, apart, picture)
 
     def _accumulated(
         self,
@@ -247,8 +289,8 @@ class SpatioTemporal(Denoiser):
         state: History,
         guides: denoise.Guides,
         noisy: denoise.Signals,
-    ) -> denoise.Signals:
-        """Return the average over frames with this one in it."""
+    ) -> tuple[denoise.Signals, denoise.Changes | None]:
+        """Return the average over frames with this one in it, and where light has changed, unless nothing asks."""
         average, changes = self._signals(frame), denoise.Changes()
         frame.launch(denoise.reproject, [settings, guides, state.guides, state.average, average])
         columns, rows = (math.ceil(size / int(denoise.BLOCK)) for size in frame.camera.resolution)
@@ -258,7 +300,7 @@ class SpatioTemporal(Denoiser):
         if self.lag > 0:
             frame.launch(denoise.find_changes, [settings, noisy, average, changes], columns * rows)
         frame.launch(denoise.add_frame, [settings, noisy, average, changes, average])
-        return average
+        return average, changes if self.lag > 0 else None
 
     def _filtered(
         self,
@@ -285,6 +327,76 @@ class SpatioTemporal(Denoiser):
             tells = wp.empty(0, dtype=wp.vec2, device=frame.device)
         return light
 
+    def _apart(
+        self,
+        frame: Frame,
+        settings: denoise.DenoiseSettings,
+        state: History | None,
+        guides: denoise.Guides,
+        filtered: denoise.Filtered,
+    ) -> ApartHistory | None:
+        """Add the light of lights that are apart to filtered diffuse light, and return the average over frames."""
+        lobes = frame.lobes()
+        if frame.apart is None or lobes is None or lobes.apart is None:
+            return None
+        light = denoise_apart.ApartLight()
+        light.noisy, light.frames = lobes.apart, self._apart_frames(frame.apart, state)
+        if state is not None and state.apart is not None:
+            light.last = state.apart.average
+        light.average = wp.empty(len(light.noisy), dtype=wp.vec4, device=frame.device)
+        before = guides if state is None else state.guides
+        frame.launch(denoise_apart.average_apart, [settings, guides, before, light, filtered])
+        return ApartHistory(light.average, frame.apart.directions)
+
+    def _apart_frames(self, lights: ApartLights, state: History | None) -> float:
+        """Return the most frames in the average of light that is apart.
+
+        Suns that move take their shadows along: so many frames are of use as they need to move by half their width.
+        Shadows of lights without size have no noise.
+        """
+        if state is None or state.apart is None or len(state.apart.directions) != len(lights.directions):
+            return 1.0
+        if len(lights.directions) == 0:
+            return 1.0
+        moved = np.linalg.norm(lights.directions - state.apart.directions, axis=1)
+        return min(max(float(np.min(lights.widths / np.maximum(2 * moved, 1e-9))), 1.0), float(self.apart_frames))
+
+    def _finished(
+        self,
+        frame: Frame,
+        settings: denoise.DenoiseSettings,
+        guides: denoise.Guides,
+        filtered: denoise.Filtered,
+        changes: denoise.Changes | None,
+        last: wp.array | None,
+    ) -> wp.array | None:
+        """Give the beauty more camera samples and average it with the last one; return what to keep of it."""
+        edges, picture = self._edges(frame), frame.struct(denoise_edges.Picture)
+        picture.shining = wp.clone(frame["emission"])
+        picture.less = wp.zeros_like(frame["depth"])
+        if changes is not None and last is not None:
+            frame.launch(denoise_edges.mark_changes, [settings, changes, picture.less])
+        if edges.samples > 0:
+            inputs = [frame.seen_data, frame.camera_data, settings, edges, guides, filtered, picture]
+            frame.launch_tiled(denoise_edges.sample_edges, inputs)
+        return self._averaged(frame, settings, edges, picture, last) if self.blend < 1 else None
+
+    def _averaged(
+        self,
+        frame: Frame,
+        settings: denoise.DenoiseSettings,
+        edges: denoise_edges.EdgeSettings,
+        picture: denoise_edges.Picture,
+        last: wp.array | None,
+    ) -> wp.array:
+        """Average the beauty with the last picture; return its reflected light, which is the next frame's last one."""
+        if last is None:
+            edges.weight, last = 1.0, wp.empty(0, dtype=wp.vec3, device=frame.device)
+        picture.beauty, kept = wp.clone(frame["beauty"]), wp.empty_like(frame["beauty"])
+        inputs = [settings, edges, frame.struct(denoise_edges.Seen), picture, last, kept, frame["beauty"]]
+        frame.launch(denoise_edges.average_pictures, inputs)
+        return kept
+
     def _settings(self, frame: Frame) -> denoise.DenoiseSettings:
         settings = denoise.DenoiseSettings()
         settings.width, settings.height = frame.camera.resolution
@@ -299,6 +411,7 @@ class SpatioTemporal(Denoiser):
     def _edges(self, frame: Frame) -> denoise_edges.EdgeSettings:
         edges = denoise_edges.EdgeSettings()
         few = frame.settings.camera_samples < self.edge_samples
+        edges.own = int(frame.settings.camera_samples == 1)
         edges.samples = self.edge_samples if frame.has_camera_rays and few else 0
         edges.seed, edges.tent = frame.seed, int(frame.settings.filter == "tent")
         edges.weight, edges.clip = self.blend, CLIP
@@ -316,15 +429,61 @@ class SpatioTemporal(Denoiser):
 
 
 @dataclass(frozen=True)
-class Oidn(Denoiser):
-    """Intel Open Image Denoise, with albedo and normals as guides; each frame for itself.
+class OidnFilter(SpatioTemporal):
+    """``SpatioTemporal`` with Open Image Denoise in place of its filter over pixels."""
 
-    Runs on the CPU, on threads of its own, whatever the frame's device. ``start`` raises OptionError where it is
-    not installed.
+    apart_frames: int = 0
+    library: Any = None
+    quality: str = "fast"
+
+    def _filtered(
+        self,
+        frame: Frame,
+        settings: denoise.DenoiseSettings,
+        guides: denoise.Guides,
+        average: denoise.Signals,
+        more: int,
+    ) -> denoise.Filtered:
+        """Return both averages filtered as pictures, with normals as guides that have no noise."""
+        width, height = frame.camera.resolution
+        normal, known = guides.guide_normal.numpy().reshape(height, width, 3), average.length.numpy() > 0
+        filtered = denoise.Filtered()
+        for lobe, name in enumerate(("diffuse", "glossy")):
+            light = getattr(average, name).numpy().reshape(height, width, 3)
+            white = np.ones_like(light)  # albedo: it takes no normals without
+            clean = self.library.denoise(light, white, normal, hdr=True, clean_aux=True, quality=self.quality)
+            spread = np.where(known[:, lobe], 0.0, -1.0)  # where light is not known, as in denoise.Filtered
+            values = np.concatenate([clean.reshape(-1, 3), spread[:, None]], axis=1).astype(np.float32)
+            setattr(filtered, name, launch.on_device(values, wp.vec4, frame.device))
+        return filtered
+
+
+@dataclass(frozen=True)
+class OidnState:
+    """State of ``Oidn``."""
+
+    library: Any = field(metadata={"derived": True})
+    """The module of Open Image Denoise."""
+    history: History
+    """What it keeps of the last frame, if it accumulates."""
+
+
+@dataclass(frozen=True)
+class Oidn(Denoiser):
+    """Intel Open Image Denoise of the average over frames of ``SpatioTemporal``, or of each frame for itself.
+
+    What is filtered of an average is light before it meets the surfaces' colours, diffuse and glossy apart; edges and
+    the average of pictures are those of ``SpatioTemporal``. It runs on the CPU, on threads of its own, whatever
+    the frame's device. ``start`` raises OptionError where it is not installed.
     """
 
-    quality: str = "high"
-    """Quality of Open Image Denoise: "high", "balanced" or "fast"."""
+    wants_lobes: ClassVar[bool] = True
+
+    quality: str = "fast"
+    """Quality of Open Image Denoise: "high", "balanced" or "fast". Of a frame for itself "high" pays."""
+    accumulate: bool = True
+    """Whether it denoises the average over frames. False is each frame for itself, with albedo and normals as guides:
+    it flickers more, and loses light in dark frames of few samples."""
 
     def validate(self) -> None:
         """Raise OptionError for an unknown quality."""
@@ -332,23 +491,35 @@ class Oidn(Denoiser):
             raise unknown_name("quality", self.quality, QUALITIES)
 
     def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
-        """Return False: the state is the library."""
-        return False
+        """Return whether it accumulates; else the state is the library alone."""
+        return self.accumulate
 
-    def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> Any:
-        """Return the library; raises OptionError where it is not installed."""
+    @property
+    def saves_state(self) -> bool:
+        """True: a file holds the average."""
+        return True
+
+    def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
+        """Return the kernels of the average and of edges."""
+        return OidnFilter().kernels(scene) if self.accumulate else ()
+
+    def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> OidnState:
+        """Return the library and a history of no frame; raises OptionError where it is not installed."""
         try:
-            return importlib.import_module("pyoidn")
+            return OidnState(importlib.import_module("pyoidn"), History.empty(scene, wp.get_device(device)))
         except (ImportError, OSError) as error:
             message = f"Open Image Denoise is not here ({error}); pip install 'warp-gi[denoise]'"
             raise OptionError(one_line(message)) from error
 
-    def apply(self, frame: Frame, state: Any) -> Any:
+    def apply(self, frame: Frame, state: OidnState) -> OidnState:
         """Fill ``frame["beauty"]``: emission as it is, and all other light denoised."""
+        if self.accumulate:
+            accumulating = OidnFilter(library=state.library, quality=self.quality)
+            return replace(state, history=accumulating.apply(frame, state.history))
         emission = frame.numpy("emission")
         noisy = np.maximum(frame.numpy("noisy") - emission, 0.0)
         albedo = np.clip(frame.numpy("albedo"), 0.0, 1.0)
-        light = state.denoise(noisy, albedo, frame.numpy("normal"), hdr=True, quality=self.quality)
+        light = state.library.denoise(noisy, albedo, frame.numpy("normal"), hdr=True, quality=self.quality)
         frame["beauty"].assign((emission + light).reshape(-1, 3))
         return state
 

@@ -26,6 +26,10 @@ class BakeError(GiError):
     """A bake file is damaged, foreign, or of another scene or other settings."""
 
 
+class UnsupportedWarning(UserWarning):
+    """A file uses what this library does not read, or reads only nearly; one for each feature, which says where."""
+
+
 def one_line(message: object, otherwise: str = "") -> str:
     """Return a message with each run of spaces and line ends as one space; ``otherwise`` if nothing is left."""
     return " ".join(str(message).split()) or otherwise

@@ -91,6 +91,29 @@ def check_writable(folder: Path) -> None:
         raise OSError(error.errno, "nothing can be written to this folder", str(folder)) from error
 
 
+def cache_folder(name: str) -> Path:
+    """Return where files that can be made again are kept: ``warp_gi/NAME`` in XDG_CACHE_HOME, or in ~/.cache."""
+    root = os.environ.get("XDG_CACHE_HOME")
+    return (Path(root) if root else Path.home() / ".cache") / "warp_gi" / name
+
+
+def prune(folder: Path, pattern: str, most_bytes: int) -> None:
+    """Remove the files that were not used for longest (modified last), until the rest are below ``most_bytes``.
+
+    Another process may remove the same files at the same time. Raises OSError for a file that may not be removed.
+    """
+    files = []
+    for path in folder.glob(pattern):
+        with contextlib.suppress(FileNotFoundError):
+            stat = path.stat()
+            files.append((stat.st_mtime, stat.st_size, path))
+    total = 0
+    for _, size, path in sorted(files, reverse=True):
+        total += size
+        if total > most_bytes:
+            path.unlink(missing_ok=True)
+
+
 def remove_stale_parts(path: str | Path) -> None:
     """Remove the temporary files that a killed process left for ``path``; those of living processes stay."""
     path = Path(path)

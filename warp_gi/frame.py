@@ -7,15 +7,16 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 import warp as wp
 
 from warp_gi import launch
 from warp_gi.errors import unknown_name
-from warp_gi.kernels import denoise, gbuffer, path_trace, types
+from warp_gi.kernels import apart_lights, denoise, gbuffer, path_samplers, path_trace, types
 from warp_gi.paths import PathRequest, sky_probability
+from warp_gi.scene.apart import ApartLights, apart_lights_of
 from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.pinhole import camera_data
@@ -60,6 +61,19 @@ class FrameSettings:
     """Whether pictures show the sky where a camera ray hits nothing."""
     wants_lobes: bool = False
     """Whether a denoiser reads guides and the light of each lobe (``Frame.lobes``)."""
+    parts_lights: bool = False
+    """Whether a denoiser wants the diffuse light of suns and of lights without size apart."""
+
+
+class Lobes(NamedTuple):
+    """Light at the first vertex, parted by the lobe that reflects it: sums over samples, vec3 [height * width]."""
+
+    diffuse: wp.array
+    """Diffuse light as it comes in: times the diffuse albedo it is the radiance that the diffuse lobe reflects."""
+    glossy: wp.array
+    """The radiance that the glossy lobe reflects."""
+    apart: wp.array | None
+    """As ``diffuse``, and not in it: light of suns and of lights without size. None where there is none."""
 
 
 class Frame:
@@ -94,7 +108,10 @@ class Frame:
         self.seed = seed
         """Hash of the sequence's seed and the frame's number."""
         self.timings: dict[str, float] = {}
-        """Wall seconds by stage; "compile" is kernel compilation, left out of the others."""
+        """Wall seconds by stage; "compile" is kernel compilation, left out of the others; "scheduler" is none of these.
+
+        All but "bake", which was before, add up to what the frame took; who writes it adds "write" and "save state".
+        """
         self.metadata: dict[str, str | int | float] = {}
         """Values by name that decide the pixels, beside camera and time."""
         self.paths = PathRequest(data.emitters)
@@ -107,6 +124,8 @@ class Frame:
         """Estimators of the pipeline by their terms; a class that serves several finds its others here."""
         self.sky_probability = sky_probability(scene)
         """Probability of sampling the sky where a path vertex samples either the sky or an emitter."""
+        self.apart: ApartLights | None = None
+        """Lights whose diffuse light paths keep apart; known once they are traced."""
         self._offers: dict[type, Any] = {}
         width, height = camera.resolution
         count = width * height
@@ -171,19 +190,17 @@ class Frame:
                 self._arrays[f"{name}_moment{order}"] = wp.zeros_like(self._arrays[name])
         return self._arrays[f"{name}_moment1"], self._arrays[f"{name}_moment2"]
 
-    def lobes(self) -> tuple[wp.array, wp.array] | None:
+    def lobes(self) -> Lobes | None:
         """Return sums over samples that estimators may add to, as paths do, or None: then nobody reads them.
 
-        Both are vec3 [height * width]. The first is diffuse light as it comes in: times the diffuse albedo it is
-        the radiance that the diffuse lobe reflects. The second is the radiance that the glossy lobe reflects. What
-        is added here is part of the terms' own buffers too; the denoiser takes it out of there.
+        What is added here is part of the terms' own buffers too; the denoiser takes it out of there.
         """
         if not self.settings.wants_lobes:
             return None
         for name in ("lobe_diffuse", "lobe_glossy"):
             if name not in self._arrays:
                 self._arrays[name] = wp.zeros_like(self._arrays["indirect"])
-        return self._arrays["lobe_diffuse"], self._arrays["lobe_glossy"]
+        return Lobes(self._arrays["lobe_diffuse"], self._arrays["lobe_glossy"], self._arrays.get("lobe_apart"))
 
     def keep_noisy(self) -> None:
         """Make the composed beauty the buffer "noisy", and an empty beauty for a denoiser to fill."""
@@ -241,6 +258,7 @@ class Frame:
         """Trace the terms that estimators asked for in this camera sample, in one launch (``PathRequest``)."""
         request = self.paths
         request.prepare()
+        self._part_lights()
         settings = path_trace.PathSettings()
         settings.terms, settings.max_depth = request.terms, request.max_depth
         settings.roulette_depth, settings.clamp = request.roulette_depth, request.clamp
@@ -254,12 +272,36 @@ class Frame:
         inputs = [self.data, self.camera_data, self.pass_settings, settings, self.hits, buffers, samplers]
         self.launch_tiled(tracer.trace_paths, inputs)
 
+    def _part_lights(self) -> None:
+        """Let paths keep the lights apart that are far brighter than they are large, if a denoiser wants that."""
+        request = self.paths
+        if not self.settings.parts_lights or request.sky.sampler is not path_samplers.SCENE_SKY:
+            return
+        terms = (bool(request.terms & bit) for bit in (path_trace.TERM_ENVIRONMENT, path_trace.TERM_EMITTERS))
+        self.apart = apart_lights_of(self.scene, self.device, *terms)
+        if self.apart is not None:
+            request.use_sky(apart_lights.APART_LIGHTS, self.apart.data)
+            self._arrays["lobe_apart"] = wp.zeros_like(self._arrays["indirect"])
+
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Add the wall time of a block to ``timings[name]``, compilation apart."""
-        compiled, started = launch.compile_seconds, time.perf_counter()
-        yield
-        wp.synchronize_device(self.device)
-        compiled = launch.compile_seconds - compiled
-        self.timings["compile"] = self.timings.get("compile", 0.0) + compiled
-        self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - started - compiled
+        with timed(self.timings, name, self.device):
+            yield
+
+
+@contextmanager
+def timed(timings: dict[str, float], name: str, device: wp.Device) -> Iterator[None]:
+    """Add the wall time of a block to ``timings[name]``, and what it compiled to ``timings["compile"]``.
+
+    What blocks within it add is left out, so that all timings add up to the time that passed.
+    """
+    timings.setdefault("compile", 0.0)
+    others, compiled = sum(timings.values()), launch.compile_seconds - timings["compile"]
+    started = time.perf_counter()
+    yield
+    wp.synchronize_device(device)
+    others = sum(timings.values()) - others
+    compiled = launch.compile_seconds - timings["compile"] - compiled
+    timings["compile"] += compiled
+    timings[name] = timings.get(name, 0.0) + time.perf_counter() - started - compiled - others

@@ -12,6 +12,7 @@ and of others. CUDA does not work there once the parent has started it: an error
 
 from __future__ import annotations
 
+import functools
 import itertools
 import os
 import threading
@@ -23,7 +24,7 @@ from typing import Any, TypeVar
 import numpy as np
 import warp as wp
 
-from warp_gi import forks, workers
+from warp_gi import forks, loading, workers
 from warp_gi.errors import OptionError
 
 Struct = TypeVar("Struct")
@@ -33,13 +34,13 @@ SLICES_PER_THREAD = 16  # enough to balance uneven work, few enough that 30 us a
 SMALLEST_SLICE = 256  # items
 CUDA_BLOCK = 256  # threads
 
-_loading = threading.RLock()  # taken across a fork, so that no thread that only the parent has is inside the compiler
+_loading = threading.RLock()  # taken across a fork, so that no thread that only the parent has is inside the linker
 _threads: int | None = None
 compile_seconds = 0.0
-"""Wall seconds that this process has spent compiling or loading kernel modules."""
+"""Wall seconds that launches of this process have waited for kernel modules to compile or load."""
 compile_cpu_seconds = 0.0
-"""CPU seconds that this process has spent compiling or loading kernel modules; fewer than wall seconds where other
-processes wanted the cores."""
+"""CPU seconds that all threads of this process have spent compiling or loading kernel modules."""
+_counting = threading.RLock()
 on_load: Callable[[str], None] | None = None
 """Called with a kernel module's name before its first launch, which may take seconds to compile; for progress."""
 _loaded: set[tuple[str, str]] = set()
@@ -126,17 +127,42 @@ def copied(source: Struct, struct: type[Struct]) -> Struct:
 
 
 def load(kernel: wp.Kernel, device: wp.Device) -> None:
-    """Compile or load the kernel's module now; add its time to ``compile_seconds`` and ``compile_cpu_seconds``."""
-    global compile_seconds, compile_cpu_seconds
-    started, cpu = time.perf_counter(), time.process_time()
+    """Compile or load the kernel's module now, or wait for the thread that does.
+
+    The time is added to ``compile_seconds``, and what this thread spent of it to ``compile_cpu_seconds``.
+    """
+    global compile_seconds
+    started = time.perf_counter()
     module = (kernel.module.name, device.alias)
-    with _loading:
-        if module not in _loaded and on_load is not None:
-            on_load(kernel.module.name)
+    if module not in _loaded and on_load is not None:
+        on_load(kernel.module.name)
+    if device.is_cpu:
+        loading.wait_for(kernel.module.name)
+    _load_here(kernel, device)
+    _loaded.add(module)
+    with _counting:
+        compile_seconds += time.perf_counter() - started
+
+
+def load_ahead(kernels: Iterable[wp.Kernel], device: wp.Device) -> None:
+    """Begin to compile or load the kernels' modules on other threads, where the CPU may use several, and return.
+
+    A launch waits for its own module alone. Kernels that an earlier call named, and this one does not, are left out if
+    no thread has begun with them. On CUDA, and with one thread, modules are loaded as they are launched.
+    """
+    if device.is_cpu and thread_count() > 1:
+        wanted = [one for one in kernels if (one.module.name, device.alias) not in _loaded]
+        loading.load_ahead(wanted, lambda kernel: _load_here(kernel, device), thread_count())
+
+
+def _load_here(kernel: wp.Kernel, device: wp.Device) -> None:
+    global compile_cpu_seconds
+    cpu = time.thread_time()
+    with loading.lock_of(kernel.module.name):
+        loading.prepare(kernel.module)
         kernel.module.load(device, 1 if device.is_cpu else CUDA_BLOCK)
-        _loaded.add(module)
-    compile_seconds += time.perf_counter() - started
-    compile_cpu_seconds += time.process_time() - cpu
+    with _counting:
+        compile_cpu_seconds += time.thread_time() - cpu
 
 
 def launch(
@@ -154,7 +180,7 @@ def launch(
         return
     load(kernel, device)
     if device.alias not in _bound.get(kernel, ()):
-        with _loading:  # the linker has locks, as the compiler
+        with _loading:  # the linker has locks that a fork has to find free
             wp.launch(kernel, dim=1, inputs=[0, *inputs], device=device, record_tape=False, record_cmd=True)
         _bound.setdefault(kernel, set()).add(device.alias)
     if device.is_cuda:
@@ -205,8 +231,11 @@ def _mismatch(expected: Any, value: object, device: wp.Device) -> str | None:
         struct: Any = getattr(value, "_cls", None)
         if struct is not expected:
             return f"expected struct {expected.key}, got {getattr(struct, 'key', type(value).__name__)}"
-        for name, variable in expected.vars.items():
-            problem = _mismatch(variable.type, getattr(value, name), device)
+        for name, kind, dtype in _arrays_of(expected):
+            field = getattr(value, name)
+            if dtype is not None and (field is None or (field.dtype is dtype and field.device is device)):
+                continue  # Warp compares the rank when a field is set
+            problem = _mismatch(kind, field, device)
             if problem:
                 return f"field {name}: {problem}"
         return None
@@ -215,9 +244,20 @@ def _mismatch(expected: Any, value: object, device: wp.Device) -> str | None:
     return None
 
 
+@functools.cache
+def _arrays_of(struct: Any) -> tuple[tuple[str, Any, type | None], ...]:
+    """Return name, type and dtype of the fields that are arrays, and of those that are structs, whose dtype is None."""
+    kinds = ((name, variable.type) for name, variable in struct.vars.items())
+    return tuple(
+        (name, kind, kind.dtype if isinstance(kind, wp.array) else None)
+        for name, kind in kinds
+        if isinstance(kind, wp.array) or hasattr(kind, "vars")
+    )
+
+
 def _unlock_loading() -> None:
-    global _loading
-    _loading = threading.RLock()
+    global _loading, _counting
+    _loading, _counting = threading.RLock(), threading.RLock()
 
 
 if hasattr(os, "register_at_fork"):

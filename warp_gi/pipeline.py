@@ -199,8 +199,9 @@ class Pipeline:
     @property
     def frame_settings(self) -> FrameSettings:
         """Settings that decide how a frame is sampled."""
-        wants_lobes = self.denoise is not None and self.denoise.wants_lobes
-        return FrameSettings(self.spp, self.camera_sample_count, self.filter, self.background, wants_lobes)
+        denoise = self.denoise or Denoiser()
+        wanted = denoise.wants_lobes, denoise.parts_lights
+        return FrameSettings(self.spp, self.camera_sample_count, self.filter, self.background, *wanted)
 
     def describe(self) -> dict[str, Any]:
         """Return all settings by dotted name, e.g. {"indirect": "BsdfPaths", "indirect.max_depth": 64, ...}."""

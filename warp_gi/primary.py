@@ -9,7 +9,11 @@ from warp_gi.kernels import gbuffer
 from warp_gi.stateful import Stateful
 
 if TYPE_CHECKING:
+    import warp as wp
+
     from warp_gi.frame import Frame
+    from warp_gi.scene.baked import BakedScene
+    from warp_gi.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,10 @@ class Primary(Stateful):
 @dataclass(frozen=True)
 class CameraRays(Primary):
     """Camera rays through the scene, jittered inside of each pixel."""
+
+    def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
+        """Return the kernel that shades hits."""
+        return (gbuffer.shade_primary,)
 
     def trace(self, frame: Frame, state: Any) -> None:
         """Trace the rays and shade what they hit."""

@@ -6,9 +6,12 @@ from collections.abc import Callable, Container, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from warp_gi import launch
 from warp_gi.baking import Bake
 from warp_gi.errors import OptionError
 from warp_gi.estimator import Estimator
+from warp_gi.foretold import kernels_of
+from warp_gi.kept import BakeFolder, cached_bake
 from warp_gi.pipeline import DEFAULT, Pipeline
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.sky_motion import sky_start
@@ -41,6 +44,7 @@ def render(
     preview: bool = False,
     exposure: float = 0.0,
     frame_time: float | None = None,
+    cache: BakeFolder | str | Path | None = None,
 ) -> Iterator[Frame]:
     """Yield the frames of a sequence, and write them to files if there is an ``output``.
 
@@ -72,6 +76,8 @@ def render(
         frame_time: Wall seconds that a frame may take here; the number of samples a pixel then follows from frames
             that are timed first. It is one for all frames, and in their metadata: a resumed sequence repeats it. The
             first frame may take more (``SpatioTemporal.first_samples``). None takes those of the pipeline.
+        cache: Folder in which bakes that take long are kept, and found the next time, or a ``gi.BakeFolder``, which the
+            command uses. The frames are the same to the last bit. None keeps none.
 
     Raises OptionError for a device that is not there, a negative frame or seed, files that frames cannot be, several
     frames for one file; BakeError for a bake of another scene or other settings; SceneError for a scene that was
@@ -82,8 +88,9 @@ def render(
     if frame_time is not None:
         check_seconds(frame_time)
     wanted = _frame_numbers(camera, frames)
-    scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, progress, bakes)
+    scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, progress, bakes, cache)
     camera = scheduler.camera
+    launch.load_ahead(kernels_of(scheduler.pipeline, scheduler.scene), scheduler.device)
     if output is None:
         if frame_time is not None and wanted:
             scheduler.take_samples(
@@ -122,6 +129,8 @@ def plan_sequence(
     *,
     output: str | Path,
     precision: Literal["half", "float"] = "half",
+    frame_time: float | None = None,
+    cache: BakeFolder | str | Path | None = None,
 ) -> Plan:
     """Return what ``render`` with these arguments and ``resume=True`` would render, and why; nothing is written.
 
@@ -131,10 +140,15 @@ def plan_sequence(
     the scene is left under the sky of the last frame.
     """
     wanted = _frame_numbers(camera, frames)
-    scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, progress, bakes)
+    scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, progress, bakes, cache)
     files = Output(Path(output), precision)
     shots = shots_of(scheduler.camera, wanted, files.pattern)
-    return SequenceRun(scheduler, shots, files).plan() if shots else Plan((), ())
+    if not shots:
+        return Plan((), ())
+    run = SequenceRun(scheduler, shots, files)
+    if frame_time is not None:
+        take_time(run, frame_time, resume=True)
+    return run.plan()
 
 
 def bake(
@@ -146,6 +160,7 @@ def bake(
     progress: Progress | None = None,
     *,
     camera_path: Camera | CameraPath | None = None,
+    cache: BakeFolder | str | Path | None = None,
 ) -> Bake:
     """Return what an estimator can know of a scene before the first frame, to be saved and used again.
 
@@ -158,6 +173,7 @@ def bake(
         camera: Where the scene will be seen from, for estimators that bake no more than that; None is everywhere.
         progress: Called with (stage, share done in [0, 1]).
         camera_path: Another name of ``camera``.
+        cache: Folder in which bakes that take long are kept, and found the next time; None keeps none.
 
     Raises OptionError for a device that is not there, an estimator that has nothing to bake, or both ``camera`` and
     ``camera_path``; SceneError for a scene that was edited after it was built.
@@ -168,11 +184,15 @@ def bake(
     if camera is not None:
         camera = camera.relative_to(scene.offset)
     told = (lambda share: progress("bake", share)) if progress else None
+
+    def make() -> Bake | None:
+        return estimator.bake(scene, device, seed, told, camera)
+
     with scene.lock:
         scene.check_unchanged()
         scene.update_sky(sky_start(scene.sky_at))
         scene.update(0.0, None, device)
-        result = estimator.bake(scene, device, seed, told, camera)
+        result = cached_bake(cache, estimator, scene, camera, launch.get_device(device), seed, make)
     if result is None and isinstance(estimator, Estimator) and estimator.radiance_cache is not None:
         raise OptionError(
             f"{type(estimator).__name__} has nothing to bake, but the cache has that its paths end in: bake its ends_in"

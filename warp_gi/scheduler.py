@@ -19,7 +19,9 @@ from warp_gi.baking import Bake, Setting, load_bake
 from warp_gi.denoise import Denoiser
 from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.estimator import Estimator
-from warp_gi.frame import Frame
+from warp_gi.forecast import tell_cost
+from warp_gi.frame import Frame, timed
+from warp_gi.kept import BakeFolder, cached_bake
 from warp_gi.kernels import compose, types
 from warp_gi.pipeline import DENOISER, Pipeline
 from warp_gi.primary import CameraRays
@@ -59,6 +61,7 @@ class FrameScheduler:
         seed: Every random number follows from it, the frame, the pixel and the sample.
         progress: Called with (stage, share done in [0, 1]) while baking and tracing.
         bakes: Bakes made before (``gi.bake``, ``gi.load_bake``), each for the estimators that it names.
+        cache: Folder in which bakes that take long are kept, and found the next time; None keeps none.
 
     Several may render one scene, in turns or on threads of their own: a frame has the scene to itself until it is
     done. Each is for one thread at a time.
@@ -75,6 +78,7 @@ class FrameScheduler:
         seed: int = 0,
         progress: Callable[[str, float], None] | None = None,
         bakes: Iterable[Bake] = (),
+        cache: BakeFolder | str | Path | None = None,
     ) -> None:
         bakes = list(bakes)
         if isinstance(scene, Bake):
@@ -98,11 +102,13 @@ class FrameScheduler:
         self._parts = self.pipeline.parts()
         self._bakes = _bakes_by_class(bakes, self._parts)
         self._bake_digests: dict[str, str] = {}
+        self._cache = cache
         self._made: dict[tuple[str, str, str], Bake] = {}
         self._states: dict[str, Any] = {}
         self._keys: dict[str, str] = {}
         if self.pipeline.denoise is not None:  # first of all: it says if it is not installed
             self._start_part(DENOISER, self.pipeline.denoise)
+        self._frames: int | None = None
         self._bake_seconds = 0.0
         self._baked_version = -1
         self._sky_time = sky_start(self.scene.sky_at)
@@ -112,13 +118,15 @@ class FrameScheduler:
     # ---- before the first frame ----
 
     @_holds_scene
-    def bake(self, sky_time: float | None = None) -> None:
+    def bake(self, sky_time: float | None = None, frames: int | None = None) -> None:
         """Let every part compute what it can before the first frame; done by the first frame otherwise.
 
         Done afresh when the scene got another environment or animation, for every part that depends on it: the others
         keep their states. ``sky_time`` is the time in seconds of a sky that is a function of time: that of the first
-        frame. None is that of the last frame, or the sky's first one before any.
+        frame. None is that of the last frame, or the sky's first one before any. ``frames`` is how many will be
+        rendered, for a line that says after how many a long bake pays; None is unknown.
         """
+        self._frames = frames or self._frames
         self._sky_time = self._sky_time if sky_time is None else sky_time
         self.scene.update_sky(self._sky_time)  # whoever rendered another time of the scene since
         if self._baked_version == self.scene.version:
@@ -145,7 +153,14 @@ class FrameScheduler:
             self._progress(f"bake {place}", 0.0)
             told = lambda share: self._progress(f"bake {place}", share)  # noqa: E731
             identity = self._bake_id(part)
-            bake = self._made.get(identity) or part.bake(whole_scene(self.scene), device, self.seed, told, self.camera)
+
+            def make() -> Bake | None:
+                whole = whole_scene(self.scene)
+                tell_cost(part, whole, self.device, self.seed, self.camera, self.pipeline.spp, self._frames)
+                return part.bake(whole, device, self.seed, told, self.camera)
+
+            where = self._cache, part, self.scene, self.camera, self.device, self.seed
+            bake = self._made.get(identity) or cached_bake(*where, make)
             if bake is not None and sum(type(one) is type(part) for one in self._parts.values()) > 1:
                 self._made[identity] = bake  # for the other places of its class
         elif bake is not None and not isinstance(self.scene, BakedScene):
@@ -196,11 +211,17 @@ class FrameScheduler:
 
         A frame that an exception interrupts leaves nothing behind: what is rendered next is as if it had not begun.
         """
-        self.scene.check_unchanged()
+        began, timings = time.perf_counter(), {"bake": 0.0, "compile": 0.0}
+        with timed(timings, "scene", self.device):
+            self.scene.check_unchanged()
+        baking = time.perf_counter()
         self.bake(frame_time(self.camera, index))
+        began += time.perf_counter() - baking
         if previous_index is None:
             previous_index = max(index - 1, 0)
-        frame = self._new_frame(index, previous_index)
+        with timed(timings, "scene", self.device):
+            frame = self._new_frame(index, previous_index)
+        frame.timings = timings
         states, denoiser = dict(self._states), self._parts.get(DENOISER)
         if isinstance(denoiser, Denoiser):
             frame.settings = replace(frame.settings, spp=denoiser.samples(frame, states[DENOISER]))
@@ -223,6 +244,8 @@ class FrameScheduler:
                 states[DENOISER] = denoiser.apply(frame, states[DENOISER])
         self._states = states  # all or nothing
         frame.finish()
+        timings["scheduler"] = max(time.perf_counter() - began - sum(timings.values()), 0.0)
+        timings["bake"] = self._bake_seconds
         return frame
 
     def take_samples(self, spp: int, frame_time: float | None = None) -> None:
@@ -249,7 +272,6 @@ class FrameScheduler:
         return other.frame(index, previous_index)
 
     def _new_frame(self, index: int, previous_index: int) -> Frame:
-        started, compiled = time.perf_counter(), launch.compile_seconds
         now = frame_time(self.camera, index)
         self.scene.update(now, frame_time(self.camera, previous_index), self.device)
         data = launch.copied(self.scene.data(self.device), types.SceneData)
@@ -261,9 +283,6 @@ class FrameScheduler:
         frame = Frame(self.scene, data, *cameras, settings, self.device, index, now, seed, previous_index)
         frame.estimators = dict(self.pipeline.estimators())
         frame.has_camera_rays = isinstance(self.pipeline.primary()[1], CameraRays)
-        compiled = launch.compile_seconds - compiled
-        frame.timings |= {"bake": self._bake_seconds, "compile": compiled}
-        frame.timings["scene"] = time.perf_counter() - started - compiled
         frame.metadata |= self.metadata()
         return frame
 
@@ -274,13 +293,14 @@ class FrameScheduler:
             primary.trace(frame, states.get(owner))
         if primary.is_whole:
             return
-        for place, cache in self.pipeline.radiance_caches():
-            cache.give(frame, states[place])
+        with frame.stage("paths"):
+            for place, cache in self.pipeline.radiance_caches():
+                cache.give(frame, states[place])
         for term, estimator in self.pipeline.estimators():
             with frame.stage(term):
                 estimator.trace(frame, states[term])
-        frame.paths.prepare()
         with frame.stage("paths"):
+            frame.paths.prepare()
             frame.trace_paths()
 
     def _camera_at(self, index: int) -> Camera:

@@ -6,7 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from warp_gi.scene.camera import views_hash
+
 if TYPE_CHECKING:
+    import warp as wp
+
     from warp_gi.baking import Bake, Setting
     from warp_gi.frame import Frame
     from warp_gi.scene.baked import BakedScene
@@ -24,6 +28,16 @@ class Ahead:
     """Number and camera of each frame that will be rendered."""
     sky_changes: bool = False
     """Whether the scene gets another sky from frame to frame."""
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What a bake will cost, told before it starts."""
+
+    bake_seconds: float
+    """CPU seconds of the bake, about."""
+    most_saved: float = 0.0
+    """CPU seconds that it can save in a frame at most; 0 where nothing is known of that."""
 
 
 _EARLIER = {
@@ -66,6 +80,20 @@ class Stateful:
         """
         return ()
 
+    def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
+        """Return a kernel of each module that this will launch: modules then compile before they are waited for.
+
+        ``scene`` None is not known yet. A module left out compiles at its first launch; one too many costs its time.
+        """
+        return ()
+
+    def samplers(self, scene: Scene | BakedScene | None = None) -> tuple[Any, ...] | None:
+        """Return the samplers of ``kernels.path_samplers`` that this will give to paths, as they are compiled in.
+
+        None says that they depend on the scene, where that is not known yet.
+        """
+        return ()
+
     # ---- before the first frame ----
 
     def bake_key(self, scene: Scene | BakedScene) -> str:
@@ -78,6 +106,23 @@ class Stateful:
     def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Setting]:
         """Return the settings that a bake depends on."""
         return {}
+
+    def bake_identity(self, scene: Scene | BakedScene, camera: Camera | CameraPath | None = None) -> str:
+        """Return what decides a bake's bits beside class, settings, seed and device: a folder keeps bakes by it.
+
+        By default the whole scene, where it is in its file, under its sky of now, and all views of ``camera``. An
+        override leaves out what the bake never reads.
+        """
+        return f"{scene.hash} {scene.offset.tolist()} {views_hash(camera)}"
+
+    def forecast(
+        self, scene: Scene, device: wp.Device, seed: int, camera: Camera | CameraPath, samples: int
+    ) -> Forecast | None:
+        """Return what ``bake`` will cost for frames of ``samples`` samples a pixel, from a small share of it; or None.
+
+        None is for a bake that takes seconds at most, or that says itself what it costs.
+        """
+        return None
 
     def bake(
         self,

@@ -12,7 +12,7 @@ from typing import Any
 from warp_gi.errors import OptionError
 
 Row = dict[str, Any]
-PACKAGES = ("warp-lang", "numpy", "mitsuba", "embreex", "pyoidn", "OpenImageIO", "bpy")
+PACKAGES = ("warp-lang", "numpy", "mitsuba", "embreex", "pyoidn", "OpenImageIO", "bpy", "pyluxcore")
 ENVIRONMENT = ("quick", "commit", "warp_gi", "python", *PACKAGES, "cpu", "cores", "threads", "device")
 """Keys of a line of results that say how it was measured."""
 SERIES = re.compile(r"[-+.\deE]+(\s+[-+.\deE]+)+")

@@ -1,7 +1,7 @@
 """Blender Cycles as a peer for whole sequences: the same file, camera path, samples and bounces, on the CPU.
 
-Both get Lambert materials and a constant sky, and no denoiser. Cycles runs in a process of its own, by this Python
-or by the one that WARP_GI_BLENDER_PYTHON names.
+Both get Lambert materials, a constant sky or a map, and no denoiser unless one is asked for. Cycles runs in a process
+of its own, by this Python or by the one that WARP_GI_BLENDER_PYTHON names.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ HOW_TO_INSTALL = (
 SKY = WHITE
 """Radiance of the constant sky, W/(m^2 sr)."""
 MAX_DEPTH = 6
+Sky = gi.Environment | tuple[float, float, float] | None
 
 
 @dataclass(frozen=True)
@@ -79,8 +81,8 @@ def compare(job: Job, folder: Path) -> Row:
     ours = _ours(job, folder)
     theirs = _blender(job, path, folder)
     last = f"{job.frames - 1:04d}.exr"
-    mine, other = (read_exr(folder / name / last)[0] for name in ("ours", "blender"))
-    a, b = mine["beauty"].astype(np.float64), next(iter(other.values()))[..., :3].astype(np.float64)
+    mine = read_exr(folder / "ours" / last)[0]["beauty"]
+    a, b = mine.astype(np.float64), rendered(folder, job.frames - 1).astype(np.float64)
     row: Row = {"table": "Blender", "scene": job.scene, "pixels": f"{job.size[0]}x{job.size[1]}", "spp": job.spp}
     row |= {"frames": job.frames, "ours frames a minute": 60 * job.frames / ours}
     row |= {"blender frames a minute": 60 * job.frames / theirs["wall s"], "faster": theirs["wall s"] / ours}
@@ -106,22 +108,63 @@ def _ours(job: Job, folder: Path) -> float:
 
 
 def _blender(job: Job, path: gi.CameraPath, folder: Path) -> dict[str, Any]:
-    cameras = [path.camera(index) for index in range(job.frames)]
-    (folder / "blender").mkdir()
+    return render(folder, [path.camera(index) for index in range(job.frames)], job.spp, SKY, MAX_DEPTH - 2)
+
+
+def render(
+    folder: Path, cameras: Sequence[gi.Camera], spp: int, sky: Sky, bounces: int, **settings: bool
+) -> dict[str, Any]:
+    """Render ``folder/scene.glb`` to ``folder/blender/0000.exr`` and so on; return what that took.
+
+    Args:
+        folder: Holds the scene, which ``write_glb`` wrote; frames and the job go there.
+        cameras: One a frame, of one size.
+        spp: Number of samples a pixel.
+        sky: Radiance of a constant sky, a map, or None for a black one.
+        bounces: Number of bounces after the first surface; direct light is none.
+        settings: ``denoise`` by Open Image Denoise, ``guiding`` of paths; both are off if not given.
+
+    Raises CalledProcessError if Blender fails.
+    """
+    (folder / "blender").mkdir(exist_ok=True)
     about = {
         "scene": str(folder / "scene.glb"),
         "output": str(folder / "blender"),
-        "resolution": job.size,
-        "spp": job.spp,
-        "bounces": MAX_DEPTH - 2,  # direct light is no bounce
+        "resolution": cameras[0].resolution,
+        "spp": spp,
+        "bounces": bounces,
         "threads": launch.thread_count(),
-        "sky": SKY,
+        "sky": _sky_of(sky, folder),
         "cameras": [(camera.world_from_camera.tolist(), math.radians(camera.hfov)) for camera in cameras],
+        **settings,
     }
     (folder / "job.json").write_text(json.dumps(about), encoding="utf-8")
     wall, text = _timed([PYTHON, str(Path(__file__).with_name("blender_render.py")), str(folder / "job.json")])
     found = next(line for line in reversed(text.splitlines()) if line.startswith("{"))
     return json.loads(found) | {"wall s": wall}
+
+
+def rendered(folder: Path, frame: int) -> np.ndarray:
+    """Return a frame that ``render`` wrote, linear, float32 [height, width, 3]."""
+    layers = read_exr(folder / "blender" / f"{frame:04d}.exr")[0]
+    return np.asarray(next(iter(layers.values()))[..., :3], np.float32)
+
+
+def _sky_of(sky: Sky, folder: Path) -> list[float] | str:
+    """Return a constant radiance, or the file of a map with its columns where Blender looks for them."""
+    if not isinstance(sky, gi.Environment):
+        return list(map(float, sky or (0.0, 0.0, 0.0)))
+    if sky.pixels is None:
+        return list(map(float, sky.mean_radiance))
+    import OpenImageIO as oiio
+
+    quarter = (
+        sky.pixels.shape[1] / 4 - sky.rotation / 360 * sky.pixels.shape[1]
+    )  # its first column looks along -x, y up
+    pixels = np.ascontiguousarray(np.roll(sky.pixels, round(quarter), axis=1) * np.float32(sky.scale))
+    image = oiio.ImageBuf(pixels)
+    image.write(str(folder / "sky.exr"))
+    return str(folder / "sky.exr")
 
 
 def _timed(command: list[str]) -> tuple[float, str]:

@@ -27,23 +27,28 @@ def main(path: str) -> None:
     scene.collection.objects.link(camera)
     scene.camera = camera
     camera.data.sensor_fit, camera.data.clip_start, camera.data.clip_end = "HORIZONTAL", 1e-3, 1e5
-    loaded, frames = time.perf_counter(), []
+    loaded, frames, seconds = time.perf_counter(), [], []
     for index, (matrix, angle) in enumerate(job["cameras"]):
-        begun = time.perf_counter()
+        begun, cpu = time.perf_counter(), time.process_time()
         camera.matrix_world = _from_rows(matrix)
         camera.data.angle = angle
         scene.cycles.seed = index
         scene.render.filepath = f"{job['output']}/{index:04d}.exr"
         bpy.ops.render.render(write_still=True)
         frames.append(time.perf_counter() - begun)
-    print(json.dumps({"load s": loaded - started, "frames": frames, "version": bpy.app.version_string}))
+        seconds.append(time.process_time() - cpu)
+    found = {"load s": loaded - started, "frames": frames, "cpu": seconds, "version": bpy.app.version_string}
+    print(json.dumps(found))
 
 
 def _settings(scene: Any, job: dict[str, Any]) -> None:
-    """Set what makes the picture: samples, bounces, a box filter; no denoiser, no adaptive sampling, no clamping."""
+    """Set what makes the picture: samples, bounces, a box filter, a denoiser; no adaptive sampling, no clamping."""
     scene.render.engine = "CYCLES"
     cycles, render = scene.cycles, scene.render
-    cycles.device, cycles.samples, cycles.use_adaptive_sampling, cycles.use_denoising = "CPU", job["spp"], False, False
+    cycles.device, cycles.samples, cycles.use_adaptive_sampling = "CPU", job["spp"], False
+    cycles.use_denoising, cycles.use_guiding = job.get("denoise", False), job.get("guiding", False)
+    if cycles.use_denoising:
+        cycles.denoiser, cycles.denoising_input_passes = "OPENIMAGEDENOISE", "RGB_ALBEDO_NORMAL"
     cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = job["bounces"]
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0.0
     cycles.pixel_filter_type, cycles.filter_width = "BOX", 1.0
@@ -53,12 +58,18 @@ def _settings(scene: Any, job: dict[str, Any]) -> None:
     render.image_settings.file_format, render.image_settings.color_depth = "OPEN_EXR", "32"
 
 
-def _light(bpy: Any, scene: Any, sky: list[float]) -> None:
-    """Set a constant sky, and let surfaces emit on their front alone."""
+def _light(bpy: Any, scene: Any, sky: list[float] | str) -> None:
+    """Set a constant sky or a map, and let surfaces emit on their front alone."""
     scene.world = bpy.data.worlds.new("sky")
     scene.world.use_nodes = True
     background = next(node for node in scene.world.node_tree.nodes if node.type == "BACKGROUND")
-    background.inputs["Color"].default_value, background.inputs["Strength"].default_value = (*sky, 1.0), 1.0
+    background.inputs["Strength"].default_value = 1.0
+    if isinstance(sky, str):
+        shown = scene.world.node_tree.nodes.new("ShaderNodeTexEnvironment")
+        shown.image = bpy.data.images.load(sky)
+        scene.world.node_tree.links.new(shown.outputs["Color"], background.inputs["Color"])
+    else:
+        background.inputs["Color"].default_value = (*sky, 1.0)
     for material in bpy.data.materials:
         shader = next((node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED"), None)
         if shader is None or not any(shader.inputs["Emission Color"].default_value[:3]):

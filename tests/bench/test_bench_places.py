@@ -179,6 +179,17 @@ def test_previews_are_pngs_and_missing_places_are_passed_over(monkeypatch, tmp_p
     assert np.array_equal(np.asarray(Image.open(written)), np.asarray(sizes["cornell_box"]))
 
 
+def test_a_preview_of_a_pipeline_with_a_history_has_one():
+    place = PLACES["cornell_box"]
+    scheduler = gi.FrameScheduler(
+        place.scene(), place.path().at_resolution(24, 16), gi.Pipeline.preset("clean", spp=1), "cpu"
+    )
+    frames = [scheduler.frame(index).numpy("beauty").copy() for index in range(3)]
+    shown = previews.tone_map(previews.stored_values("beauty", frames[2]))
+    assert np.array_equal(previews.render("cornell_box", (24, 16), 1, 2, preset="clean"), shown)
+    assert previews.README_PICTURES["assets/atrium.jpg"].pipeline == "clean"
+
+
 def test_previews_are_never_larger_than_the_place():
     assert previews.preview_size((960, 540)) == (480, 270)
     assert previews.preview_size((320, 200)) == (320, 200) and previews.preview_size((4000, 1)) == (480, 1)

@@ -167,8 +167,8 @@ HAND_TYPED = re.compile(
     r"|(?<![\w.])\d+\.\d+|\b(?:twice|(?:two|three|four|five|six|seven|eight|nine|ten) times)\b|^\|.*\b\d.*$",
     re.MULTILINE,
 )
-NOT_MEASURED = ("3.10", "3.13", "8 bytes", "40 bytes", "5.1", "2.0")
-"""Python's versions, sizes that the code sets, a paper's section, glTF's version."""
+NOT_MEASURED = ("3.10", "3.13", "8 bytes", "40 bytes", "5.1", "2.0", "0.5s")
+"""Python's versions, sizes that the code sets, a paper's section, glTF's version, a flag's value."""
 
 
 def hand_typed(text):

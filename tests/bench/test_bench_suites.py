@@ -91,7 +91,7 @@ def test_a_sequence_has_a_part_for_each_pipeline(monkeypatch):
     monkeypatch.setattr(sequence, "measure", measure)
     monkeypatch.setattr(sequence.blender_peer, "rows", lambda job: [{"job": job}])
     assert [row["pipeline"] for row in sequence.run(False)[:-1]] == list(sequence.CASES)
-    assert [size for _, size in asked] == [sequence.FULL_SIZE] * 5
+    assert [size for _, size in asked] == [sequence.FULL_SIZE] * 6
     asked.clear()
     *ours, theirs = sequence.run(True)
     assert [row["pipeline"] for row in ours] == ["path", "probes, 4x4x4 of 64x64", "reuse"]

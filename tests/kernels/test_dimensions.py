@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from warp_gi.kernels import sampling as d
+from warp_gi.scene.sky_map import MOST_RAYS
 from warp_gi.techniques.paths.estimators import BsdfPaths
 
 KERNELS = sorted((Path(__file__).resolve().parents[2] / "kernels").glob("*.py"))
@@ -83,6 +84,12 @@ def test_numbers_of_a_path_do_not_meet():
     path_numbers()
     with pytest.raises(AssertionError, match="both draw"):
         path_numbers(VERTICES + 2)  # where they begin to
+
+
+def test_lights_that_are_apart_draw_beside_paths():
+    """Suns have numbers of their own, of the index and the seed of the path."""
+    drawn = {(STRATIFIED, d.APART_DIMENSION + sun) for sun in range(MOST_RAYS)}
+    assert not path_numbers().keys() & drawn
 
 
 def test_probes_draw_beside_their_paths():

@@ -62,12 +62,12 @@ def transfer_is_sampled(data: Transfer, scene: SceneData) -> wp.bool:
 
 
 @wp.func
-def transfer_prefetch(data: Transfer, scene: SceneData, u: wp.vec3):
+def transfer_prefetch(data: Transfer, scene: SceneData, u: wp.vec3, first: wp.bool):
     pass
 
 
 @wp.func
-def transfer_sample(data: Transfer, scene: SceneData, u: wp.vec3) -> EnvironmentSample:
+def transfer_sample(data: Transfer, scene: SceneData, u: wp.vec3, first: wp.bool) -> EnvironmentSample:
     z = 1.0 - 2.0 * u[0]
     ring = wp.sqrt(wp.max(0.0, 1.0 - z * z))
     angle = 2.0 * wp.pi * u[1]
@@ -76,12 +76,12 @@ def transfer_sample(data: Transfer, scene: SceneData, u: wp.vec3) -> Environment
 
 
 @wp.func
-def transfer_arrival(data: Transfer, scene: SceneData, e: EnvironmentSample) -> EnvironmentLookup:
+def transfer_arrival(data: Transfer, scene: SceneData, e: EnvironmentSample, first: wp.bool) -> EnvironmentLookup:
     return EnvironmentLookup(wp.vec3(0.0, 0.0, 0.0), UNIFORM_SPHERE_PDF)
 
 
 @wp.func
-def transfer_lookup(data: Transfer, scene: SceneData, direction: wp.vec3) -> EnvironmentLookup:
+def transfer_lookup(data: Transfer, scene: SceneData, direction: wp.vec3, first: wp.bool) -> EnvironmentLookup:
     return EnvironmentLookup(wp.vec3(0.0, 0.0, 0.0), UNIFORM_SPHERE_PDF)
 
 

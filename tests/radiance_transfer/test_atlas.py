@@ -25,6 +25,7 @@ from scene_tools import GREY, quad, sphere
 
 import warp_gi as gi
 from warp_gi import launch
+from warp_gi.files import prune
 from warp_gi.techniques.radiance_transfer.bake import OTHERWISE
 from warp_gi.techniques.shared.atlas import chart_cache, chart_job, chart_worker, charts
 from warp_gi.techniques.shared.atlas.atlas import Atlas
@@ -43,7 +44,7 @@ def run_here(_, job, progress=None):
 
 
 def patched(patch, folder):
-    patch.setattr(chart_cache, "cache_folder", lambda: folder / "charts")
+    patch.setattr(chart_cache, "cache_folder", lambda name: folder / "charts")
     patch.setattr(charts.ChartJob, "run", run_here)
 
 
@@ -522,7 +523,7 @@ def change(arrays, how):
     ],
 )
 def test_whole_files_with_wrong_contents_are_made_again(monkeypatch, tmp_path, kind, how):
-    monkeypatch.setattr(chart_cache, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(chart_cache, "cache_folder", lambda name: tmp_path)
     scene = scene_of(ball(rings=4))
     first = make_atlas(scene, settings(resolution=64), "cpu")
     (file,) = tmp_path.glob(f"{kind}-*.npz")
@@ -540,7 +541,7 @@ def test_whole_files_with_wrong_contents_are_made_again(monkeypatch, tmp_path, k
 
 def test_files_that_another_process_removes_at_once(monkeypatch, tmp_path):
     """As it lists them, and as it removes them."""
-    monkeypatch.setattr(chart_cache, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(chart_cache, "cache_folder", lambda name: tmp_path)
     monkeypatch.setattr(chart_cache, "MOST_BYTES", 10)
     for number in range(2):
         (tmp_path / f"{number}.npz").write_bytes(bytes(90 + number))
@@ -556,7 +557,7 @@ def test_files_that_another_process_removes_at_once(monkeypatch, tmp_path):
     with monkeypatch.context() as patch:
         patch.setattr(Path, "exists", lambda path: os.path.exists(path))
         patch.setattr(Path, "stat", raced)
-        chart_cache._prune(tmp_path)
+        prune(tmp_path, "*.npz", chart_cache.MOST_BYTES)
     assert sorted(gone) == ["0.npz", "1.npz"] and not list(tmp_path.iterdir())
 
 
@@ -592,13 +593,13 @@ print(float(np.abs(uvs).sum()))
 
 def test_a_cache_that_cannot_be_written(monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
-    monkeypatch.setattr(chart_cache, "cache_folder", lambda: tmp_path / "file" / "charts")
+    monkeypatch.setattr(chart_cache, "cache_folder", lambda name: tmp_path / "file" / "charts")
     with pytest.warns(UserWarning, match="cannot be kept"):
         assert make_atlas(scene_of(ball(rings=4)), settings(resolution=64), "cpu").count > 0
 
 
 def test_oldest_files_leave_a_full_cache(monkeypatch, tmp_path):
-    monkeypatch.setattr(chart_cache, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(chart_cache, "cache_folder", lambda name: tmp_path)
     monkeypatch.setattr(chart_cache, "MOST_BYTES", 5000)
     for number in range(4):
         chart_cache.cached("cut", {"n": np.array(number)}, lambda: {"n": np.zeros(500, np.int32)})

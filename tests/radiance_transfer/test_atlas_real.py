@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(autouse=True)
 def _own_cache(monkeypatch, tmp_path_factory):
-    monkeypatch.setattr(chart_cache, "cache_folder", lambda: tmp_path_factory.getbasetemp() / "charts")
+    monkeypatch.setattr(chart_cache, "cache_folder", lambda name: tmp_path_factory.getbasetemp() / "charts")
 
 
 def real_scene(file):

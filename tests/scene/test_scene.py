@@ -202,7 +202,10 @@ BAD_SCENES = {
         lambda: Scene(quad_material(normal_texture=Texture("t", checker(), wrap=("repeat", "tile")))),
         "unknown wrap mode 'tile'",
     ),
-    "cutoff": (lambda: Scene(quad_material(alpha_cutoff=1.5)), "'paint': alpha_cutoff must be from 0 to 1, got 1.5"),
+    "cutoff": (
+        lambda: Scene(quad_material(alpha_cutoff=-1.5)),
+        "'paint': alpha_cutoff must be from 0 to inf, got -1.5",
+    ),
     "roughness": (lambda: Scene(quad_material(roughness=float("nan"))), "roughness must be from 0 to 1"),
     "emission": (lambda: Scene(quad_material(emission=(-1, 0, 0))), "emission must be from 0"),
     "color": (lambda: Scene(quad_material(base_color=(1, 1))), "base_color must be 3 numbers"),

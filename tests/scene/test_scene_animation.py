@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import warp as wp
-from scene_tools import triangle
+from scene_tools import card, triangle
 from scipy.spatial.transform import Rotation, Slerp
 
 from warp_gi.errors import OptionError, SceneError
@@ -152,3 +152,21 @@ def test_emitters_are_placed_without_a_download(monkeypatch):
             assert placed.two_sided.tolist() == sides.tolist() == [False, True]
             seen.append(corners[0, 0, 0])
     assert len(set(seen[:3])) == 3
+
+
+def test_bounds_hold_every_pose_of_a_key():
+    """A chain below a node that rests, with clocks of its own and a link without keys."""
+    rng = np.random.default_rng(5)
+    nodes = [Node("rest", [card()], np.diag([1.0, 2.0, 1.0, 1.0]))]
+    for i in range(5):
+        rows = zip(np.sort(rng.random(6)) * 3, rng.normal(size=(6, 4)), rng.normal(size=(6, 3)), strict=True)
+        keys = [Keyframe(float(t), tuple(p), tuple(q / np.linalg.norm(q)), tuple(np.abs(p) + 0.5)) for t, q, p in rows]
+        placement = np.eye(4)
+        placement[:3, 3] = rng.normal(size=3)
+        nodes.append(Node(f"n{i}", [card(half=0.5)] if i % 2 else [], placement, i, None if i == 3 else keys))
+    scene = Scene(nodes)
+    times = {*np.linspace(0, scene.duration, 33), *(key.time for node in nodes for key in node.keyframes or ())}
+    boxes = [scene.node_box(i, time) for time in times for i, node in enumerate(nodes) if node.meshes]
+    np.testing.assert_allclose(scene.bounds, [np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))], atol=1e-5)
+    still = Scene([nodes[0], Node("lamp", [], np.eye(4), None, nodes[1].keyframes)])
+    np.testing.assert_array_equal(still.bounds, [[-1, -2, 0], [1, 2, 0]])  # what moves has no triangles

@@ -278,7 +278,7 @@ BROKEN = {
     "not a glb": (write("x.glb", b"PK\3\4 something else"), "does not begin with 'glTF'"),
     "version 1": (write("x.glb", struct.pack("<4sII", b"glTF", 1, 12)), "glTF version 1"),
     "no chunk": (write("x.glb", struct.pack("<4sII", b"glTF", 2, 12)), "must hold a JSON chunk"),
-    "not json": (write("x.gltf", b"{ 'asset': }"), "x.gltf' cannot be read as GLTF"),
+    "not json": (write("x.gltf", b"{ 'asset': }"), "x.gltf' is not glTF: its JSON text is damaged"),
     "missing texture": (
         edited(lambda glb, folder: (folder / "wood.png").rename(folder / "wood_2.png")),
         "texture 'wood.png' of material 'plank' .* is missing; did you mean 'wood_2.png'",
@@ -312,7 +312,10 @@ BROKEN = {
         edited(lambda glb, _: glb.json["bufferViews"][0].update(byteOffset=10**6)),
         "buffer view 0 passes the end",
     ),
-    "no such mesh": (edited(lambda glb, _: glb.json["nodes"][0].update(mesh=99)), "IndexError"),
+    "no such mesh": (
+        edited(lambda glb, _: glb.json["nodes"][0].update(mesh=99)),
+        "node 'n': names mesh 99, and the file has 1 meshes",
+    ),
     "cycle": (edited(lambda glb, _: glb.json["nodes"][0].update(children=[0])), "two parents or on itself"),
     "draco": (
         edited(lambda glb, _: glb.json.update(extensionsRequired=["KHR_draco_mesh_compression"])),
@@ -323,8 +326,8 @@ BROKEN = {
         "unknown wrap mode '7'",
     ),
     "cutoff": (
-        edited(lambda glb, _: glb.json["materials"][0].update(alphaMode="MASK", alphaCutoff=2.0)),
-        "'plank': alpha_cutoff must be from 0 to 1",
+        edited(lambda glb, _: glb.json["materials"][0].update(alphaMode="MASK", alphaCutoff=-2.0)),
+        "'plank': alpha_cutoff must be from 0 to inf, got -2",
     ),
 }
 

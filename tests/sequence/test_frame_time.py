@@ -77,6 +77,8 @@ def test_a_resumed_sequence_repeats_the_number(tmp_path, monkeypatch):
     assert all(f.metadata["pipeline.spp"] == 3 and f.metadata["frame_time"] == 0.3 for f in whole)
     (tmp_path / "a.0002.exr").unlink()
     found.append(7)
+    plan = gi.plan_sequence(scene, path(), frames=range(3), **arguments)
+    assert set(plan.problems) == {2}
     again = list(gi.render(scene, path(), frames=range(3), resume=True, **arguments))
     assert [f.index for f in again] == [0, 1, 2] or [f.index for f in again] == [2]
     np.testing.assert_array_equal(again[-1].numpy("beauty"), whole[-1].numpy("beauty"))

@@ -111,6 +111,17 @@ def fork_while_a_thread_compiles():
         thread.join()
 
 
+def fork_while_modules_load_ahead():
+    """The fork waits for what has begun; the child loads by itself what it launches."""
+    launch.set_threads(2)
+    with tempfile.TemporaryDirectory() as folder:
+        wp.config.kernel_cache_dir = folder
+        kernels = {factor: make_kernel(factor) for factor in (2, 3, 4)}
+        launch.load_ahead(kernels.values(), launch.get_device("cpu"))
+        assert in_fork(lambda: all(launches_right(kernels[factor], factor) for factor in (4, 3, 2)))
+        assert all(launches_right(kernels[factor], factor) for factor in (2, 3, 4))
+
+
 def fork_while_a_thread_renders():
     """The child gets a scene that is half moved, and locks that a thread holds which it does not have."""
     scene = moving_room()
@@ -156,7 +167,8 @@ def fork_in_a_launch():
 
 
 def write_exr_in_the_child():
-    """OpenImageIO keeps threads for EXR files, which a child lacks."""
+    """OpenEXR has threads while it writes, which a child lacks: none stay, and a fork waits until a file is done."""
+    launch.set_threads(2)
     values = {"beauty": np.random.default_rng(1).random((96, 128, 3), np.float32)}
     with tempfile.TemporaryDirectory() as folder:
         path, other = Path(folder) / "parent.exr", Path(folder) / "child.exr"
@@ -164,6 +176,10 @@ def write_exr_in_the_child():
         assert in_fork(lambda: [write_exr(other, values, {}, "float") for _ in range(2)]) == [None, None]
         assert path.read_bytes() == other.read_bytes()
         assert np.array_equal(read_exr(other)[0]["beauty"], values["beauty"])
+        writer = threading.Thread(target=lambda: [write_exr(path, values, {}, "float") for _ in range(20)])
+        writer.start()
+        while writer.is_alive():
+            assert in_fork(lambda: write_exr(other, values, {}, "float")) is None
 
 
 def render_in_other_processes(method):
@@ -203,6 +219,7 @@ FORKING = (
     render_first_in_the_child,
     compile_in_the_child,
     fork_while_a_thread_compiles,
+    fork_while_modules_load_ahead,
     fork_while_a_thread_renders,
     fork_in_a_launch,
     write_exr_in_the_child,

@@ -23,8 +23,9 @@ PIPELINES = {
     "reuse": gi.Pipeline.preset("reuse", **LEARNS),
     "growing": gi.Pipeline.preset("dvf", environment=FIELD, indirect=None, spp=2),
     "denoised": gi.Pipeline.preset("path", spp=2, denoise="spatiotemporal"),
+    "sunny": gi.Pipeline.preset("clean", denoise=gi.SpatioTemporal(blend=0.5)),  # a sun, whose light is apart
 }
-SAVED = ("reuse", "growing", "denoised")
+SAVED = ("reuse", "growing", "denoised", "sunny")
 
 
 class Case:
@@ -32,7 +33,7 @@ class Case:
 
     def __init__(self, name):
         self.scene = gi.builtin_scene("cornell_box")
-        self.scene.environment = 1.0
+        self.scene.environment = gi.SunSky(elevation=30.0) if name == "sunny" else 1.0
         self.arguments = {"pipeline": PIPELINES[name], "frames": range(COUNT), "seed": 3}
         if name == "growing":  # a bake of little of what is seen grows by a few cells a frame
             narrow = gi.Camera.look_at((0, 1, 3.4), (0, 0.3, 0), hfov=12.0, resolution=(24, 16))
@@ -130,6 +131,7 @@ def test_a_torn_and_a_missing_frame(name, cases, tmp_path):
         told = {
             "reuse": "no saved state fits, and the emitters light and the indirect light depend on the frames before",
             "growing": "no saved state fits, and the environment light depends on the frames before",
+            "sunny": "no saved state fits, and the denoiser depends on the frames before",
             "denoised": "no saved state fits, and the denoiser depends on the frames before",
         }[name]
         assert plan.frames == tuple(range(COUNT)) and plan.restart == plan.reason(0) == plan.reason(4) == told

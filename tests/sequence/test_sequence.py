@@ -11,7 +11,7 @@ from frame_tools import make_frame
 from warp_gi.errors import OptionError, SceneError
 from warp_gi.files import remove_stale_parts, replacing
 from warp_gi.sequence import frames as sequence
-from warp_gi.sequence.exr import read_exr, write_exr
+from warp_gi.sequence.exr import read_exr, stored_format, write_exr
 from warp_gi.sequence.preview import tone_map
 
 
@@ -97,6 +97,14 @@ def test_values_past_half_stay_finite(tmp_path):
     back = sequence.read_frame(sequence.write_frame(frame, tmp_path / "a.exr"))
     assert back.formats["beauty"] == "float" and back.formats["albedo"] == "half"
     np.testing.assert_array_equal(back.numpy("beauty"), frame.numpy("beauty"))
+
+
+@pytest.mark.parametrize(
+    ("values", "format"),
+    [([1.0, -65504.0], "half"), ([1.0, -65505.0], "float"), ([np.nan, 1e6], "float"), ([np.inf, np.nan, 2.0], "half")],
+)
+def test_format_goes_by_finite_values(values, format):
+    assert stored_format("beauty", np.array(values, np.float32)) == format
 
 
 def test_full_precision_on_demand(tmp_path):

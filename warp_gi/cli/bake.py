@@ -26,6 +26,7 @@ from warp_gi.cli.options import flag, parse_options, value_given
 from warp_gi.cli.report import Reporter, run_command
 from warp_gi.errors import OptionError
 from warp_gi.files import check_target, check_writable, remove_stale_parts
+from warp_gi.kept import BakeFolder
 from warp_gi.rendering import bake
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.files.sky_images import split_layer
@@ -74,6 +75,8 @@ class BakeOptions(SceneOptions):
     """Number of principal components to export in place of all numbers, where a technique can; see above."""
     view: Annotated[Path | None, flag("FILE", "none")] = None
     """Page, .html, that shows the bake in a browser and needs no network, where a technique has one; see above."""
+    cache: bool = True
+    """Use the bake that an earlier run kept, and keep this one if it takes long; see render."""
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print nothing but errors."""
     settings: Annotated[Stateful, tyro.conf.arg(name="")] = field(
@@ -194,6 +197,7 @@ def run(options: BakeOptions, report: Reporter) -> None:
             options.seed,
             camera if is_of_view and not options.everywhere else None,
             lambda stage, share: tell(share),
+            cache=BakeFolder() if options.cache else None,
         )
     compiled = launch.compile_seconds - compiled
     seconds = time.perf_counter() - started - compiled

@@ -27,7 +27,9 @@ from warp_gi.cli.pipelines import find_denoiser, pipeline_named, with_settings_s
 from warp_gi.cli.report import Reporter, run_command
 from warp_gi.errors import OptionError
 from warp_gi.files import check_target, check_writable, frame_path
+from warp_gi.foretold import kernels_of
 from warp_gi.frame import Frame
+from warp_gi.kept import BakeFolder
 from warp_gi.pipeline import DEFAULT, NORMAL, Pipeline
 from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.camera import Camera, CameraPath
@@ -36,7 +38,6 @@ from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence.frame_time import parse_seconds, take_time
 from warp_gi.sequence.frames import parse_frames
 from warp_gi.sequence.resume import Output, Plan, SequenceRun, Shot, shots_of
-from warp_gi.techniques.reuse.pictures import check_pictures, reuse_pictures
 
 DESCRIPTION = """Render a sequence of frames to EXR files with named layers, and PNG previews.
 
@@ -95,6 +96,9 @@ class Render(SceneOptions):
     """Write a tone-mapped PNG beside each frame."""
     exposure: float = 0.0
     """Exposure of previews in stops."""
+    cache: bool = True
+    """Keep bakes that take long, and use them the next time: in the folder WARP_GI_BAKES, or warp_gi/bakes in
+    XDG_CACHE_HOME or ~/.cache, at most 2 GiB. Frames are the same."""
     reuse_pictures: Annotated[Path | None, flag("FOLDER", "none")] = None
     """Folder for pictures of what the last frame's samples taught: the octree's leaves, samples and lights in them,
     shares of exploration and of the BSDF. The pipeline has to learn, as reuse and hybrid do."""
@@ -136,18 +140,26 @@ def run(options: Render, report: Reporter) -> None:
     output = find_output(options)
     check_targets(options)
     bakes = [load_bake(path) for path in options.bake]
+    device = launch.get_device(options.device)
+    launch.load_ahead(kernels_of(options.settings), device)
     with report.phase("scene"):
         scene = BakedScene(load_bake(options.scene)) if options.scene.endswith(BAKE_SUFFIX) else find_scene(options)
         camera = find_camera(options, scene, report)
     if resolution:
         camera = camera.at_resolution(*resolution)
+    launch.load_ahead(kernels_of(options.settings, scene), device)
     describe(options, scene, report)
     shots = find_shots(options, camera)
     if isinstance(scene, Scene):
         move_sky(scene, options.environment_turn, camera, [shot.index for shot in shots])
     source = scene.bake if isinstance(scene, BakedScene) else scene
-    scheduler = FrameScheduler(source, camera, options.settings, options.device, options.seed, report.stage, bakes)
+    cache = BakeFolder() if options.cache else None
+    scheduler = FrameScheduler(
+        source, camera, options.settings, options.device, options.seed, report.stage, bakes, cache
+    )
     if options.reuse_pictures is not None:
+        from warp_gi.techniques.reuse.pictures import check_pictures  # its kernels are not for every run
+
         check_pictures(scheduler, shots[-1].camera, options.reuse_pixel)
     sequence = SequenceRun(scheduler, shots, output)
     with report.phase("bake"):
@@ -225,6 +237,8 @@ def render_shots(options: Render, plan: Plan, sequence: SequenceRun, report: Rep
             for stage, seconds in frame.timings.items():
                 times.setdefault(stage, []).append(seconds)
             if options.reuse_pictures is not None and shot is plan.todo[-1]:
+                from warp_gi.techniques.reuse.pictures import reuse_pictures
+
                 reuse_pictures(sequence.scheduler, frame, options.reuse_pictures, options.reuse_pixel)
                 report.line(f"pictures: {options.reuse_pictures}")
             del frame  # before there is a next one

@@ -12,33 +12,47 @@ from numpy.typing import ArrayLike
 from warp_gi.errors import SceneError
 from warp_gi.scene.model import Keyframe, Node
 
+CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))
+"""Which of low and high each corner of a box has along each axis, int [8, 3]."""
+POSES_AT_ONCE = 1 << 18
+"""Number of matrices that are held at once while a scene's bounds are found."""
+
 
 def pose_matrix(translation: ArrayLike, rotation: ArrayLike, scale: ArrayLike) -> np.ndarray:
-    """Return float64 [4, 4]: scale first, then the rotation (quaternion x, y, z, w), then the translation."""
-    x, y, z, w = np.asarray(rotation, np.float64) / np.linalg.norm(np.asarray(rotation))
-    matrix = np.eye(4)
-    matrix[:3, :3] = [
+    """Return float64 [..., 4, 4]: scale first, then the rotation (quaternion x, y, z, w), then the translation."""
+    rotation = np.asarray(rotation, np.float64)
+    x, y, z, w = np.moveaxis(rotation / np.linalg.norm(rotation, axis=-1, keepdims=True), -1, 0)
+    rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    matrix[:3, :3] *= np.asarray(scale, np.float64)
-    matrix[:3, 3] = translation
+    matrix = np.zeros((*x.shape, 4, 4))
+    matrix[..., 3, 3] = 1.0
+    for i, row in enumerate(rows):
+        for j, value in enumerate(row):
+            matrix[..., i, j] = value
+    matrix[..., :3, :3] *= np.asarray(scale, np.float64)[..., None, :]
+    matrix[..., :3, 3] = translation
     return matrix
 
 
-def slerp(start: ArrayLike, end: ArrayLike, weight: float) -> np.ndarray:
-    """Return the unit quaternion (x, y, z, w) ``weight`` of the shorter way from ``start`` to ``end``."""
-    a, b = (np.asarray(one, np.float64) / np.linalg.norm(np.asarray(one)) for one in (start, end))
-    cosine = float(a @ b)
-    if cosine < 0.0:
-        b, cosine = -b, -cosine
-    if cosine > 1.0 - 1e-9:
-        blend = a + weight * (b - a)
-    else:
-        angle = np.arccos(cosine)
-        blend = np.sin((1.0 - weight) * angle) * a + np.sin(weight * angle) * b
-    return blend / np.linalg.norm(blend)
+def slerp(start: ArrayLike, end: ArrayLike, weight: float | np.ndarray) -> np.ndarray:
+    """Return the unit quaternions (x, y, z, w) ``weight`` of the shorter way from ``start`` to ``end``, [..., 4].
+
+    ``weight`` is a number or [..., 1].
+    """
+    a, b = (np.asarray(one, np.float64) for one in (start, end))
+    a, b = (one / np.linalg.norm(one, axis=-1, keepdims=True) for one in (a, b))
+    cosine = np.sum(a * b, axis=-1, keepdims=True)
+    b, cosine = np.where(cosine < 0.0, -b, b), np.abs(cosine)
+    angle = np.arccos(np.minimum(cosine, 1.0))
+    near = cosine > 1.0 - 1e-9
+    sine = np.where(near, 1.0, np.sin(angle))
+    rest = np.where(near, 1.0 - weight, np.sin((1.0 - weight) * angle) / sine)
+    part = np.where(near, weight, np.sin(weight * angle) / sine)
+    blend = rest * a + part * b
+    return blend / np.linalg.norm(blend, axis=-1, keepdims=True)
 
 
 def keyframe_matrix(keyframes: Sequence[Keyframe], time: float) -> np.ndarray:
@@ -99,6 +113,73 @@ def world_matrices(nodes: Sequence[Node], time: float) -> list[np.ndarray]:
     return world
 
 
+def _keyframe_matrices(keyframes: Sequence[Keyframe], times: np.ndarray) -> np.ndarray:
+    """Return ``keyframe_matrix`` at each of ``times`` [s], float64 [time, 4, 4]."""
+    rows = keyframe_rows(keyframes)
+    after = np.searchsorted(rows[:, 0], times, side="right")
+    a = rows[np.maximum(after - 1, 0)]
+    b = rows[np.minimum(after, len(rows) - 1)]
+    span = np.where(b[:, :1] > a[:, :1], b[:, :1] - a[:, :1], 1.0)
+    weight = np.clip((times[:, None] - a[:, :1]) / span, 0.0, 1.0)
+    mixed = (1.0 - weight) * a + weight * b
+    return pose_matrix(mixed[:, 1:4], slerp(a[:, 4:8], b[:, 4:8], weight), mixed[:, 8:11])
+
+
+def keyframe_rows(keyframes: Sequence[Keyframe]) -> np.ndarray:
+    """Return time, translation, rotation and scale of each keyframe, float64 [keyframe, 11]."""
+    return np.array([(k.time, *k.translation, *k.rotation, *k.scale) for k in keyframes], np.float64)
+
+
+def box_corners(node: Node) -> np.ndarray:
+    """Return the corners of the boxes around a node's meshes, in its space, float64 [8 * mesh, 3]."""
+    corners = []
+    for mesh in node.meshes:
+        box = np.stack([mesh.points.min(axis=0), mesh.points.max(axis=0)]).astype(np.float64)
+        corners.append(box[CORNERS, np.arange(3)])
+    return np.concatenate(corners)
+
+
+def swept_box(nodes: Sequence[Node], moving: Sequence[bool], evenly: np.ndarray) -> np.ndarray:
+    """Return a box around the poses of moving meshes: low and high corner, float64 [2, 3].
+
+    The poses are those at the keys of whatever moves together, and at the times ``evenly`` [s].
+    """
+    rest, top = world_matrices(nodes, 0.0), list(range(len(nodes)))
+    groups: dict[int, list[int]] = {}
+    for index, node in enumerate(nodes):
+        if node.parent is not None and moving[node.parent]:
+            top[index] = top[node.parent]
+        if moving[index]:
+            groups.setdefault(top[index], []).append(index)
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for group in groups.values():
+        if any(nodes[index].meshes for index in group):
+            times = np.union1d(evenly, key_times([nodes[index] for index in group]))
+            step = max(POSES_AT_ONCE // len(group), 16)
+            for start in range(0, len(times), step):
+                box = _group_box(nodes, group, rest, times[start : start + step])
+                low, high = np.minimum(low, box[0]), np.maximum(high, box[1])
+    return np.stack([low, high])
+
+
+def _group_box(nodes: Sequence[Node], group: list[int], rest: list[np.ndarray], times: np.ndarray) -> np.ndarray:
+    """Return a box around all meshes of a group of nodes at all ``times`` [s]; ``rest`` places what does not move."""
+    world: dict[int, np.ndarray] = {}
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for index in group:
+        node = nodes[index]
+        keys = node.keyframes
+        placed = _keyframe_matrices(keys, times) if keys else np.asarray(node.parent_from_node, np.float64)
+        if node.parent is not None:
+            placed = (world[node.parent] if node.parent in world else rest[node.parent]) @ placed
+        world[index] = placed
+        if any(len(mesh.points) for mesh in node.meshes):
+            matrices = placed.reshape(-1, 4, 4)
+            points = np.matmul(box_corners(node), matrices[:, :3, :3].transpose(0, 2, 1)) + matrices[:, None, :3, 3]
+            low, high = np.minimum(low, points.min(axis=(0, 1))), np.maximum(high, points.max(axis=(0, 1)))
+    return np.stack([low, high])
+
+
 def moving_nodes(nodes: Sequence[Node]) -> list[bool]:
     """Return for every node whether it, or one above it, has keyframes."""
     moving: list[bool] = []
@@ -116,10 +197,23 @@ def check_keyframes(keyframes: Sequence[Keyframe], name: str) -> None:
     """Raise SceneError unless there are keyframes, their times rise, and every number is finite."""
     if not keyframes:
         raise SceneError(f"node {name!r}: expected at least one keyframe, got none")
-    for key in keyframes:
-        values = np.asarray([key.time, *key.translation, *key.rotation, *key.scale], np.float64)
-        if values.shape != (11,) or not np.isfinite(values).all() or not np.linalg.norm(key.rotation) > 1e-6:
-            raise SceneError(f"node {name!r}: keyframe needs finite numbers and a unit quaternion, got {key}")
-    for a, b in itertools.pairwise(keyframes):
-        if not a.time < b.time:
-            raise SceneError(f"node {name!r}: keyframe times must rise, got {a.time} s before {b.time} s")
+    try:
+        rows = keyframe_rows(keyframes)
+        good = np.isfinite(rows).all(axis=1) & (np.linalg.norm(rows[:, 4:8], axis=1) > 1e-6) & (rows.shape[1] == 11)
+    except (TypeError, ValueError, IndexError):
+        good = np.array([_is_keyframe(key) for key in keyframes])
+    if not good.all():
+        wrong = keyframes[int(np.argmin(good))]
+        raise SceneError(f"node {name!r}: keyframe needs finite numbers and a unit quaternion, got {wrong}")
+    falls = np.flatnonzero(~(np.diff(rows[:, 0]) > 0.0))
+    if len(falls):
+        a, b = rows[falls[0] : falls[0] + 2, 0].tolist()
+        raise SceneError(f"node {name!r}: keyframe times must rise, got {a} s before {b} s")
+
+
+def _is_keyframe(key: Keyframe) -> bool:
+    """Return whether a keyframe holds as many numbers as it should."""
+    try:
+        return np.asarray([key.time, *key.translation, *key.rotation, *key.scale], np.float64).shape == (11,)
+    except (TypeError, ValueError):
+        return False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Iterable, Sequence
@@ -254,3 +255,16 @@ def _hermite(times: np.ndarray, rows: np.ndarray, time: float) -> np.ndarray:
         + (3 * s**2 - 2 * s**3) * rows[i + 1]
         + (s**3 - s**2) * h * slopes[i + 1]
     )
+
+
+def views_hash(camera: Camera | CameraPath | None) -> str:
+    """Return a SHA-256 of all views of a camera, in hexadecimal digits: placements, lenses and sizes."""
+    digest = hashlib.sha256(b"warp_gi views 1")
+    views = [camera] if isinstance(camera, Camera) else []
+    if isinstance(camera, CameraPath):
+        views = [camera.camera(index) for index in range(camera.frame_count)]
+    for one in views:
+        digest.update(one.world_from_camera.tobytes())
+        lens = (one.hfov, *one.resolution, *one.lens_shift, one.pixel_aspect)
+        digest.update(np.array(lens, np.float64).tobytes())
+    return digest.hexdigest()

@@ -49,6 +49,10 @@ class DeviceScene:
         )
         data.geometry.normals = self._array(flat.normals, wp.vec3)
         data.geometry.uvs = self._array(flat.uvs, wp.vec2)
+        if flat.further_uvs is not None:
+            data.geometry.further_uvs = self._array(flat.further_uvs, wp.vec2)
+        if flat.colors is not None:
+            data.geometry.colors = self._array(flat.colors, wp.vec4)
         data.geometry.indices = self._array(flat.indices, wp.vec3i)
         data.geometry.materials = self._array(flat.materials, wp.int32)
         data.geometry.objects = self._array(flat.objects, wp.int32)

@@ -22,7 +22,7 @@ from warp_gi.scene.watching import Change, Owner, Watch
 if TYPE_CHECKING:
     from warp_gi.kernels import types
     from warp_gi.scene.contents import SceneContents
-    from warp_gi.scene.environment import SkyMap
+    from warp_gi.scene.sky_map import SkyMap
 
 NEW_SCENE = "make a new scene: gi.Scene(scene.nodes, scene.lights, scene.environment, scene.cameras)"
 NEW_SKY = "assign it again: scene.environment = ..."
@@ -199,9 +199,11 @@ class Edits:
             ("points", slot.vertices),
             ("normals", slot.vertices),
             ("uvs", slot.vertices),
+            ("further_uvs", slot.vertices),
+            ("colors", slot.vertices),
             ("indices", slot.triangles),
         ):
-            if not np.array_equal(getattr(part, field), getattr(flat, field)[place]):
+            if not geometry.is_copy(field, getattr(part, field), getattr(flat, field), place):
                 return field
         used = len(part.indices) and slot.row < len(self.scene.materials)
         return "material" if used and not _alike(mesh.material, self.scene.materials[slot.row]) else None
@@ -343,7 +345,7 @@ def _row_edit(material: Material, data: types.SceneData, row: int, hint: str) ->
             table, texels = textures.texture_table([image])
             first, *others = table.dtype.names or ()
             start = int(entry[first])
-            is_same = all(entry[name] == table[0][name] for name in others)
+            is_same = all(np.array_equal(entry[name], table[0][name]) for name in others)
             if not is_same or not np.array_equal(data.texels.numpy()[start : start + len(texels)], texels):
                 return f"{field} {image.name!r}"
     return None

@@ -12,7 +12,7 @@ from warp_gi.errors import SceneError
 from warp_gi.kernels import types
 from warp_gi.scene.geometry import FlatGeometry
 from warp_gi.scene.model import Material, Node, PunctualLight
-from warp_gi.scene.textures import box_means, linear_rgb
+from warp_gi.scene.textures import box_means, linear_rgb, texture_coordinates
 
 LIGHT_KINDS = {
     "point": types.EMITTER_POINT,
@@ -77,9 +77,13 @@ def emissive_triangles(flat: FlatGeometry, materials: Sequence[Material]) -> tup
         material = materials[index]
         radiance = np.asarray(material.emission, np.float64)
         if material.emission_texture is not None:
-            uvs = flat.uvs[flat.indices[triangles[mine]]]
             texture = material.emission_texture
+            ids = flat.indices[triangles[mine]]
+            further = None if flat.further_uvs is None else flat.further_uvs[ids]
+            uvs = texture_coordinates(texture, flat.uvs[ids], further)
             radiance = radiance * box_means(linear_rgb(texture), texture.wrap, uvs.min(axis=1), uvs.max(axis=1))
+        if material.colors_emit and flat.colors is not None:
+            radiance = radiance * flat.colors[flat.indices[triangles[mine]], :3].astype(np.float64).mean(axis=1)
         powers[mine] *= radiance @ LUMINANCE * (2.0 if material.double_sided else 1.0)
     kept = powers > 0.0
     return triangles[kept], powers[kept]

@@ -17,98 +17,27 @@ import math
 import warnings
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import warp as wp
 
-from warp_gi.alias import AliasTable
-from warp_gi.color import LUMINANCE
 from warp_gi.errors import OptionError, SceneError
 from warp_gi.kernels import types
-from warp_gi.launch import get_device, on_device
+from warp_gi.launch import get_device
 from warp_gi.scene import harmonics
 from warp_gi.scene.files.sky_images import check_size, read_sky, split_layer
 from warp_gi.scene.model import Color
-from warp_gi.scene.sky import SunSky, node_solid_angles
-from warp_gi.scene.sun import LAMPS_SHARE, MOST_SUNS, MapSplit, split_map
-from warp_gi.scene.watching import Watch
+from warp_gi.scene.sky import SunSky
+from warp_gi.scene.sky_map import SkyMap, SunTables
+from warp_gi.scene.sun import LAMPS_SHARE, MOST_SUNS
 
 T = TypeVar("T")
 
 __all__ = ["Environment", "SunSky", "SunSplit", "as_environment"]
 
 NEGLIGIBLE_NEGATIVE = 1e-4  # share of the sum of all pixels; less is set to 0
-
-
-class SkyMap:
-    """The pixels of a map, and what is derived from them once; shared by all rotations and scales of the map."""
-
-    def __init__(self, pixels: np.ndarray) -> None:
-        self.pixels = pixels
-        self.arrays: dict[str, tuple[wp.array, wp.array, wp.array]] = {}
-        self.watch: Watch | None = None
-        self._derived: dict[Hashable, Any] = {}
-
-    @cached_property
-    def digest(self) -> bytes:
-        return hashlib.sha256(np.array(self.pixels.shape, np.int64).tobytes() + self.pixels.tobytes()).digest()
-
-    @cached_property
-    def mean(self) -> np.ndarray:
-        """Radiance averaged over the sphere, W/(m^2 sr), float64 [3]; exact for the bilinear map."""
-        height, width = self.pixels.shape[:2]
-        return self.pixels.sum(1, dtype=np.float64).T @ node_solid_angles(height, width) / (4 * math.pi)
-
-    def once(self, key: Hashable, make: Callable[[np.ndarray], T]) -> T:
-        """Return ``make(pixels)``, computed once a key."""
-        if key not in self._derived:
-            self._derived[key] = make(self.pixels)
-        return self._derived[key]
-
-    def harmonics_of(self, order: int) -> np.ndarray:
-        """Spherical harmonics in the map's own space, float64 [3, order^2]."""
-        return self.once(("harmonics", order), lambda pixels: harmonics.project(pixels, order))
-
-    def split(self, brighter_than: float, most: int) -> tuple[MapSplit, SkyMap]:
-        """Return the map's suns, and the map without them."""
-
-        def make(pixels: np.ndarray) -> tuple[MapSplit, SkyMap]:
-            parts = split_map(pixels, brighter_than, most)
-            return parts, self if parts.pixels is pixels else SkyMap(parts.pixels)
-
-        return self.once(("split", brighter_than, most), make)
-
-    def on(self, device: wp.Device) -> tuple[wp.array, wp.array, wp.array]:
-        """Return texels, alias table over them and densities by row, arrays on the device."""
-        if device.alias not in self.arrays:
-            weights, row_pdfs = _node_weights(self.pixels)
-            texels = on_device(self.pixels.reshape(-1, 3), wp.vec3, device)
-            rows = on_device(row_pdfs.astype(np.float32), wp.float32, device)
-            self.arrays[device.alias] = (texels, AliasTable.build(weights).on(device), rows)
-            self.watch = self.watch or Watch([(self, ("pixels", "arrays"))])
-        return self.arrays[device.alias]
-
-    def is_edited(self) -> bool:
-        """Whether the pixels differ from what is on devices."""
-        return self.watch is not None and bool(self.watch.changes())
-
-
-def _node_weights(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return float64 [height, width]: luminance times the integral of the node's tent, and ``Environment.row_pdfs``.
-
-    Steradians are those in the middle of a row of patches, for all of the patch: ``environment.patch_pdf`` counts the
-    same. The densities are float64 [height + 1].
-    """
-    height, width = pixels.shape[:2]
-    step = math.pi / (height - 1)
-    sines = np.sin((np.arange(-1, height) + 0.5) * step)
-    sines[[0, -1]] = 0.0  # nothing lies beyond the poles
-    area = 0.5 * (sines[:-1] + sines[1:]) * step * (2 * math.pi / width)
-    weights = pixels.astype(np.float64) @ LUMINANCE * area[:, None]
-    return weights, sines / weights.sum()
 
 
 @dataclass(eq=False)
@@ -226,6 +155,21 @@ class Environment:
             sky = Environment(rest.pixels, None, self.rotation, self.scale, self.name, rest)
         irradiances = parts.irradiances * self.scale
         return SunSplit(sky, directions, irradiances, parts.cos_cones, parts.cos_discs, parts.share)
+
+    @property
+    def has_small_suns(self) -> bool:
+        """Whether there are suns that are worth a ray of their own."""
+        return self._map is not None and not self.is_black and bool(self._map.small_suns()[0].nodes)
+
+    def small_suns(self, device: wp.Device) -> tuple[SunTables, Environment] | None:
+        """Return the suns that are worth a ray of their own, and the sky without them; None if there are none.
+
+        A map is searched once, and its tables are made once a device: rotations and scales share them.
+        """
+        tables = None if self._map is None or self.is_black else self._map.sun_tables(device)
+        if tables is None:
+            return None
+        return tables, Environment(tables.rest.pixels, None, self.rotation, self.scale, self.name, tables.rest)
 
     def once_a_map(self, key: Hashable, make: Callable[[np.ndarray], T]) -> T | None:
         """Return ``make(pixels)``, computed once for all rotations and scales of a map; None for a sky without one.

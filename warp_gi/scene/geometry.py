@@ -32,6 +32,10 @@ class FlatGeometry:
     """Index in the scene's materials of each triangle's material, int32 [triangle]."""
     objects: np.ndarray
     """Object id of each triangle, int32 [triangle]; it counts the nodes that have meshes."""
+    colors: np.ndarray | None
+    """Linear colours and coverage, float32 [vertex, 4]; None if no mesh has any."""
+    further_uvs: np.ndarray | None
+    """Second set of texture coordinates, v up, float32 [vertex, 2]; None if no mesh has one."""
     vertex_starts: list[int]
     """First vertex of each node, and the number of vertices at the end."""
 
@@ -71,7 +75,13 @@ def check_mesh(mesh: Mesh, owner: str) -> None:
         if low < 0 or high >= len(points):
             wrong = low if low < 0 else high
             raise SceneError(f"{owner}: index {wrong} is out of range, there are {len(points)} vertices")
-    for label, width in (("normals", 3), ("uvs", 2)):
+    colors = mesh.colors
+    if colors is not None:
+        if np.shape(colors) not in ((len(points), 3), (len(points), 4)):
+            raise SceneError(f"{owner}: colors must be [{len(points)}, 3] or 4, got {list(np.shape(colors))}")
+        if not (np.min(colors, initial=0.0) >= 0.0 and np.max(colors, initial=0.0) <= 1.0):
+            raise SceneError(f"{owner}: colors must be from 0 to 1, got {np.min(colors):g} to {np.max(colors):g}")
+    for label, width in (("normals", 3), ("uvs", 2), ("further_uvs", 2)):
         values = getattr(mesh, label)
         if values is not None and np.shape(values) != (len(points), width):
             raise SceneError(f"{owner}: {label} must be [{len(points)}, {width}], got {list(np.shape(values))}")
@@ -120,6 +130,8 @@ def flatten(nodes: Sequence[Node], materials: Sequence[Material], world: Sequenc
     """
     vertex_count = sum(len(mesh.points) for node in nodes for mesh in node.meshes)
     triangle_count = sum(len(mesh.indices) for node in nodes for mesh in node.meshes)
+    has_colors = any(mesh.colors is not None for node in nodes for mesh in node.meshes)
+    has_further = any(mesh.further_uvs is not None for node in nodes for mesh in node.meshes)
     flat = FlatGeometry(
         points=np.empty((vertex_count, 3), np.float32),
         normals=np.zeros((vertex_count, 3), np.float32),
@@ -127,6 +139,8 @@ def flatten(nodes: Sequence[Node], materials: Sequence[Material], world: Sequenc
         indices=np.empty((triangle_count, 3), np.int32),
         materials=np.empty(triangle_count, np.int32),
         objects=np.empty(triangle_count, np.int32),
+        colors=np.ones((vertex_count, 4), np.float32) if has_colors else None,
+        further_uvs=np.zeros((vertex_count, 2), np.float32) if has_further else None,
         vertex_starts=[],
     )
     index_of = {id(material): index for index, material in enumerate(materials)}
@@ -138,9 +152,11 @@ def flatten(nodes: Sequence[Node], materials: Sequence[Material], world: Sequenc
             vertices = slice(vertex, vertex + len(mesh.points))
             triangles = slice(triangle, triangle + len(mesh.indices))
             if mesh.uvs is not None:
-                flat.uvs[vertices] = np.clip(
-                    np.nan_to_num(mesh.uvs, nan=0.0, posinf=0.0, neginf=0.0), -LARGEST_UV, LARGEST_UV
-                )
+                flat.uvs[vertices] = _finite_uvs(mesh.uvs)
+            if mesh.further_uvs is not None and flat.further_uvs is not None:
+                flat.further_uvs[vertices] = _finite_uvs(mesh.further_uvs)
+            if mesh.colors is not None and flat.colors is not None:
+                flat.colors[vertices, : np.shape(mesh.colors)[1]] = mesh.colors
             flat.indices[triangles] = np.asarray(mesh.indices)[:, ::-1] if mirrored else mesh.indices
             flat.indices[triangles] += vertex
             if id(mesh.material) not in index_of:
@@ -154,6 +170,18 @@ def flatten(nodes: Sequence[Node], materials: Sequence[Material], world: Sequenc
         object_index += bool(node.meshes)
     flat.vertex_starts.append(vertex)
     return flat
+
+
+def is_copy(field: str, values: np.ndarray | None, copy: np.ndarray | None, place: slice) -> bool:
+    """Return whether the flat geometry's field ``copy`` holds one mesh's values at a place."""
+    none = 1.0 if field == "colors" else 0.0  # what stands there for a mesh without the field, where others have it
+    if copy is None:
+        return values is None or bool(np.all(values == none))
+    return np.array_equal(np.full_like(copy[place], none) if values is None else values, copy[place])
+
+
+def _finite_uvs(uvs: np.ndarray) -> np.ndarray:
+    return np.clip(np.nan_to_num(uvs, nan=0.0, posinf=0.0, neginf=0.0), -LARGEST_UV, LARGEST_UV)
 
 
 def place(flat: FlatGeometry, node: Node, matrix: np.ndarray, vertex: int) -> None:

@@ -6,19 +6,23 @@ import os
 import struct
 import warnings
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from warp_gi.errors import OptionError, SceneError, one_line, unknown_name
 from warp_gi.files import user_path
 from warp_gi.scene.environment import Sky
+from warp_gi.scene.files.from_trimesh import is_trimesh, trimesh_parts
 from warp_gi.scene.files.images import missing_file
 from warp_gi.scene.files.parts import SceneParts
 from warp_gi.scene.geometry import triangulated
 from warp_gi.scene.model import Material, Mesh, Node
 from warp_gi.scene.pinhole import offset_text
 from warp_gi.scene.scene import Scene
+
+if TYPE_CHECKING:
+    import trimesh
 
 EXTENSIONS = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
 
@@ -35,17 +39,18 @@ DAMAGE = (ArithmeticError, AttributeError, EOFError, LookupError, NameError, OSE
 
 
 def load_scene(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | trimesh.Trimesh | trimesh.Scene,
     environment: Sky = None,
     smooth: float | None = None,
     scale: float = 1.0,
     recentre: bool | None = None,
     up: Literal["x", "y", "z"] = "y",
 ) -> Scene:
-    """Load a scene from a GLB, glTF, OBJ (with MTL), PLY, STL or OFF file.
+    """Load a scene from a GLB, glTF, OBJ (with MTL), PLY, STL or OFF file, or from an object of trimesh.
 
     Args:
-        path: The file; textures and buffers it names are looked up beside it.
+        path: The file; textures and buffers it names are looked up beside it. Or a ``trimesh.Trimesh`` or
+            ``trimesh.Scene``, whose materials, colours and transforms are taken.
         environment: A path to a sky map, an RGB radiance, an Environment, a SunSky, or None for black.
         smooth: Crease angle in degrees. Meshes without normals get smooth ones except across
             edges that bend more than this; None leaves them flat, as glTF asks.
@@ -57,33 +62,26 @@ def load_scene(
         up: Axis of the file that points up, and becomes y. Where it is z, as in surveys and CAD, (x, y, z) of the file
             is (x, z, -y) of the scene. All else, cameras too, is then given in the turned coordinates.
 
+    Gives an UnsupportedWarning for each feature that the file uses and this library does not read in full.
     Raises SceneError if the file or anything it names is missing, damaged or unusable: one line.
     """
-    if not str(path):
-        raise SceneError("the name of the scene file is empty; give a GLB, glTF, OBJ or PLY file")
-    path = user_path(path)
-    suffix = path.suffix.lower()
-    if not path.is_file():
-        raise missing_file(path, "scene file")
-    if suffix not in EXTENSIONS:
-        raise SceneError(f"{str(path)!r}: unknown kind of file {suffix!r}; expected one of {', '.join(EXTENSIONS)}")
     if smooth is not None and not 0.0 <= smooth <= 180.0:
         raise OptionError(f"smooth must be an angle from 0 to 180 degrees, got {smooth}")
     if not (np.isfinite(scale) and scale > 0.0):
         raise OptionError(f"scale must be a finite number above 0, got {scale}")
     if up not in UPRIGHT:
         raise unknown_name("axis that points up", up, UPRIGHT)
-    try:
-        parts = _read(path, suffix)
-    except SceneError:
-        raise
-    except (*DAMAGE, struct.error) as error:
-        reason = one_line(error)[:200]
-        kind = suffix[1:].upper()
-        raise SceneError(
-            f"{str(path)!r} cannot be read as {kind} ({type(error).__name__}: {reason}); export or copy it again"
-        ) from error
-    parts = _recentred(parts, path, scale, recentre).single()
+    if isinstance(path, str | os.PathLike):
+        if not str(path):
+            raise SceneError("the name of the scene file is empty; give a GLB, glTF, OBJ or PLY file")
+        path = user_path(path)
+        name, told, parts = path.stem, str(path), _file_parts(path)
+    elif is_trimesh(path):
+        name, told, parts = "trimesh", "the trimesh object", trimesh_parts(path)
+    else:
+        raise OptionError(f"expected the path of a scene file or an object of trimesh, got a {type(path).__name__}")
+    parts.findings.warn(told, stacklevel=2)
+    parts = _recentred(parts, told, scale, recentre).single()
     if smooth is not None:
         parts = parts.smoothed(smooth)
     if scale != 1.0:
@@ -91,13 +89,13 @@ def load_scene(
     if up != "y":
         parts = parts.turned(np.array(UPRIGHT[up], np.float64))
     if not any(len(mesh.indices) for node in parts.nodes for mesh in node.meshes):
-        raise SceneError(f"{str(path)!r} holds no triangles; export it with faces")
-    scene = Scene(parts.nodes, parts.lights, environment, parts.cameras, path.stem, parts.camera_nodes)
+        raise SceneError(f"{told!r} holds no triangles; export it with faces")
+    scene = Scene(parts.nodes, parts.lights, environment, parts.cameras, name, parts.camera_nodes)
     scene.offset = parts.offset
     return scene
 
 
-def _recentred(parts: SceneParts, path: Path, scale: float, recentre: bool | None) -> SceneParts:
+def _recentred(parts: SceneParts, told: str, scale: float, recentre: bool | None) -> SceneParts:
     """Return the parts around the origin, if that is asked for, or is needed and not refused."""
     if recentre is False:
         return parts
@@ -108,11 +106,30 @@ def _recentred(parts: SceneParts, path: Path, scale: float, recentre: bool | Non
         return parts
     if recentre is None:
         warnings.warn(
-            f"{str(path)!r} lies {farthest:,.0f} m from its origin, where float32 has steps of {1000 * step:.3g} mm:"
+            f"{told!r} lies {farthest:,.0f} m from its origin, where float32 has steps of {1000 * step:.3g} mm:"
             f" recentred by {offset_text(scale * offset)} m; cameras are still in the file's coordinates",
             stacklevel=3,
         )
     return parts.recentred(offset)
+
+
+def _file_parts(path: Path) -> SceneParts:
+    """Return the contents of a scene file."""
+    suffix = path.suffix.lower()
+    if not path.is_file():
+        raise missing_file(path, "scene file")
+    if suffix not in EXTENSIONS:
+        raise SceneError(f"{str(path)!r}: unknown kind of file {suffix!r}; expected one of {', '.join(EXTENSIONS)}")
+    try:
+        return _read(path, suffix)
+    except SceneError:
+        raise
+    except (*DAMAGE, struct.error) as error:
+        reason = one_line(error)[:200]
+        kind = suffix[1:].upper()
+        raise SceneError(
+            f"{str(path)!r} cannot be read as {kind} ({type(error).__name__}: {reason}); export or copy it again"
+        ) from error
 
 
 def _read(path: Path, suffix: str) -> SceneParts:
@@ -124,16 +141,19 @@ def _read(path: Path, suffix: str) -> SceneParts:
         from warp_gi.scene.files.obj import read_obj
 
         return read_obj(path)
+    if suffix == ".ply":
+        from warp_gi.scene.files.ply import read_ply
+
+        return read_ply(path)
     return _read_single_mesh(path, suffix)
 
 
 def _read_single_mesh(path: Path, suffix: str) -> SceneParts:
-    """Read a file that holds one mesh without materials: PLY, STL or OFF."""
+    """Read a file that holds one mesh without materials: STL or OFF."""
     from trimesh.exchange.load import mesh_loaders
 
-    options = {"skip_materials": True} if suffix == ".ply" else {}
     with path.open("rb") as file:
-        contents = mesh_loaders[suffix[1:]](file, file_type=suffix[1:], **options)
+        contents = mesh_loaders[suffix[1:]](file, file_type=suffix[1:])
     points, faces = contents.get("vertices"), contents.get("faces")
     if points is None or faces is None or not len(faces):
         raise SceneError(f"{str(path)!r} holds no triangles; export it with faces")

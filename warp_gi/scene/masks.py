@@ -24,18 +24,22 @@ def alpha_masks(
     index_of = {id(image): index for index, image in enumerate(images)}
     face_mask = np.full(len(flat.indices), -1, np.int32)
     masks: list[tuple[int, float, float]] = []
+    alphas = None if flat.colors is None else np.ascontiguousarray(flat.colors[:, 3])
     for index, material in enumerate(materials):
         if material.alpha_cutoff is None:
             continue
         triangles = np.flatnonzero(flat.materials == index)
         texture = material.base_color_texture
+        thinnest = 1.0  # coverage of the thinnest vertex; triangles with no hole for this reason are just slower
+        if alphas is not None and len(triangles):
+            thinnest = float(alphas[flat.indices[triangles]].min())
         if texture is None:
-            holed = triangles if material.alpha < material.alpha_cutoff else triangles[:0]
+            holed = triangles if material.alpha * thinnest < material.alpha_cutoff else triangles[:0]
         else:
-            cut = texture.pixels[..., 3:] * (material.alpha / 255.0) < material.alpha_cutoff
+            cut = texture.pixels[..., 3:] * (material.alpha * thinnest / 255.0) < material.alpha_cutoff
             uvs = flat.uvs[flat.indices[triangles]]
             holed = triangles[box_means(cut, texture.wrap, uvs.min(axis=1), uvs.max(axis=1))[:, 0] > 0.0]
         if len(holed):
             face_mask[holed] = len(masks)
             masks.append((-1 if texture is None else index_of[id(texture)], material.alpha, material.alpha_cutoff))
-    return AlphaMasks(face_mask, masks, flat.uvs, textures, texels) if masks else None
+    return AlphaMasks(face_mask, masks, flat.uvs, textures, texels, alphas) if masks else None

@@ -21,6 +21,13 @@ class Texture:
     """Whether red, green and blue are sRGB-coded (colours) or linear (normals, roughness)."""
     wrap: tuple[str, str] = ("repeat", "repeat")
     """Wrap modes in u and v: "repeat", "clamp" or "mirror"."""
+    nearest: bool = False
+    """Whether lookups take the nearest texel; else they are bilinear."""
+    uv_set: int = 0
+    """Coordinates that it is looked up at: 0 for the mesh's ``uvs``, 1 for its ``further_uvs``; 0 for a base colour."""
+    transform: tuple[Color, Color] | None = None
+    """Rows of the affine map from those coordinates to the texture's own, v up: u' = row 0 . (u, v, 1), and v' of row
+    1; None is the identity, and has to be for a base colour."""
 
 
 @dataclass(eq=False)
@@ -38,7 +45,11 @@ class Material:
     roughness: float = 1.0
     """Perceptual roughness in [0, 1]; the GGX alpha is its square."""
     specular: float = 1.0
-    """KHR_materials_specular factor: 1 is the usual F0 of 0.04, 0 is pure Lambert."""
+    """KHR_materials_specular factor on ``reflectance``, and the reflectance at grazing angles; 0 is pure Lambert. It
+    is multiplied with the alpha of ``specular_texture``."""
+    reflectance: Color = (0.04, 0.04, 0.04)
+    """Reflectance of what is no metal at normal incidence, before ``specular``; cut off at 1. It is multiplied with
+    ``reflectance_texture``."""
     emission: Color = (0.0, 0.0, 0.0)
     """Emitted radiance in W/(m^2 sr), multiplied with ``emission_texture``."""
     base_color_texture: Texture | None = None
@@ -49,6 +60,12 @@ class Material:
     """Texture of normals in tangent space, x right and y up; linear."""
     emission_texture: Texture | None = None
     """Texture of the emission, sRGB-coded."""
+    specular_texture: Texture | None = None
+    """Texture whose alpha is a factor on ``specular``."""
+    reflectance_texture: Texture | None = None
+    """Texture of the reflectance at normal incidence, sRGB-coded."""
+    colors_emit: bool = False
+    """Whether colours of vertices multiply the emission, too, as those of surfaces without light do."""
     normal_scale: float = 1.0
     """Factor on the x and y of the normal texture's normals."""
     alpha_cutoff: float | None = None
@@ -73,6 +90,11 @@ class Mesh:
     """Texture coordinates, float32 [vertex, 2], v up; None is all zero."""
     name: str = "mesh"
     """Name in error messages."""
+    further_uvs: np.ndarray | None = None
+    """Second set of texture coordinates, for textures of ``uv_set`` 1, float32 [vertex, 2], v up; None is all zero."""
+    colors: np.ndarray | None = None
+    """Linear colours from 0 to 1, float32 [vertex, 3], or [vertex, 4] with coverage; they multiply base colour and
+    alpha of the material. None is all 1."""
 
 
 @dataclass(eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -31,18 +32,20 @@ def smooth_mesh(mesh: Mesh, angle: float) -> Mesh:
     position = np.unique(np.asarray(mesh.points), axis=0, return_inverse=True)[1].reshape(-1)[indices].reshape(-1)
     normals = _corner_normals(position, np.repeat(face_normals, 3, axis=0), corner_angles.reshape(-1), angle)
 
-    # one vertex for all corners that had one (without uvs: one position) and agree on the normal
+    # one vertex for all corners that had one (without uvs and colours: one position) and agree on the normal
     steps = np.round((normals + 1.0) * NORMAL_STEPS).astype(np.int64)
-    vertex = position if mesh.uvs is None else indices.reshape(-1)
+    parts: dict[str, Any] = {"uvs": mesh.uvs, "further_uvs": mesh.further_uvs, "colors": mesh.colors}
+    vertex = position if all(part is None for part in parts.values()) else indices.reshape(-1)
     key = ((vertex * 1024 + steps[:, 0]) * 1024 + steps[:, 1]) * 1024 + steps[:, 2]
     _, first, corner_vertex = np.unique(key, return_index=True, return_inverse=True)
     source = indices.reshape(-1)[first]
+    split: dict[str, Any] = {label: None if part is None else np.asarray(part)[source] for label, part in parts.items()}
     return replace(
         mesh,
         points=np.asarray(mesh.points)[source],
         normals=normals[first].astype(np.float32),
-        uvs=None if mesh.uvs is None else np.asarray(mesh.uvs)[source],
         indices=corner_vertex.reshape(-1, 3).astype(np.int32),
+        **split,
     )
 
 

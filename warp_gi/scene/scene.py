@@ -18,7 +18,7 @@ from warp_gi.launch import get_device
 from warp_gi.scene import animation, emitters, geometry, textures
 from warp_gi.scene.device_scene import DeviceScene
 from warp_gi.scene.edits import Edits
-from warp_gi.scene.model import Keyframe, Material, Mesh, Node, PunctualLight
+from warp_gi.scene.model import Keyframe, Material, Node, PunctualLight
 from warp_gi.scene.sky_motion import appearance, first_sky, sky_at_time
 
 if TYPE_CHECKING:
@@ -203,7 +203,8 @@ class Scene:
     def memory_bytes(self) -> int:
         """Bytes of geometry, materials and textures on one device, without the tree of ray queries and the sky."""
         flat = self._flat
-        arrays = (flat.points, flat.normals, flat.uvs, flat.indices, flat.materials, flat.objects)
+        arrays = [flat.points, flat.normals, flat.uvs, flat.indices, flat.materials, flat.objects]
+        arrays += [part for part in (flat.colors, flat.further_uvs) if part is not None]
         texels = {id(t.pixels): t.pixels.nbytes for t in textures.distinct_textures(self.materials)}
         per_triangle = 4 * self.triangle_count  # Geometry.emitters
         previous = flat.points.nbytes if self.is_animated else 0
@@ -228,11 +229,13 @@ class Scene:
             if masked.any():
                 triangles = masked[flat.materials]
                 _update(digest, triangles, flat.materials[triangles], flat.uvs[flat.indices[triangles]])
+                if flat.colors is not None:
+                    _update(digest, flat.colors[flat.indices[triangles], 3])
                 for material in (m for m in self.materials if m.alpha_cutoff is not None):
                     texture = material.base_color_texture
                     _update(digest, np.array([material.alpha, material.alpha_cutoff]))
                     if texture is not None:
-                        _update(digest, repr(texture.wrap), texture.pixels[..., 3])
+                        _update(digest, repr((texture.wrap, texture.nearest)), texture.pixels[..., 3])
             for index, node in enumerate(self.nodes):
                 if self._moving[index]:
                     keys = [asdict(key) for key in node.keyframes or ()]
@@ -258,10 +261,12 @@ class Scene:
             digest = hashlib.sha256(b"warp_gi scene 1" + self.geometry_hash.encode())
             flat = self._flat
             _update(digest, flat.normals, flat.uvs, flat.materials, flat.objects)
+            _update(digest, *(part for part in (flat.colors, flat.further_uvs) if part is not None))
             images = textures.distinct_textures(self.materials)
             _update(digest, textures.material_table(self.materials, images))
             for image in images:
-                _update(digest, repr((image.srgb, image.wrap)), image.pixels)
+                how = image.srgb, image.wrap, image.nearest, image.uv_set, image.transform
+                _update(digest, repr(how), image.pixels)
             world = animation.world_matrices(self.nodes, 0.0)
             _update(digest, emitters.emitter_table(self._emissive, self.lights, world))
             _update(digest, repr([light.node for light in self.lights]))
@@ -298,10 +303,8 @@ class Scene:
 
     def node_box(self, index: int, time: float) -> np.ndarray:
         """Return a box around the meshes of node ``index`` at ``time`` [s]: low and high corner, float64 [2, 3]."""
-        matrix, corners = self.world_from_node(index, time), []
-        for mesh in self.nodes[index].meshes:
-            corners.append(_box_corners(mesh))
-        points = np.concatenate(corners).astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+        matrix, corners = self.world_from_node(index, time), animation.box_corners(self.nodes[index])
+        points = corners @ matrix[:3, :3].T + matrix[:3, 3]
         return np.stack([points.min(axis=0), points.max(axis=0)])
 
     def world_from_node(self, index: int, time: float) -> np.ndarray:
@@ -370,20 +373,12 @@ class Scene:
     def _all_bounds(self) -> np.ndarray:
         flat = self._flat
         used = np.unique(flat.indices) if len(flat.points) > 3 * len(flat.indices) else slice(None)
-        boxes = [flat.points[used].min(axis=0), flat.points[used].max(axis=0)]
+        boxes = [np.stack([flat.points[used].min(axis=0), flat.points[used].max(axis=0)])]
         if self.is_animated:
-            times = {*np.linspace(0.0, self.duration, POSES_FOR_BOUNDS), *animation.key_times(self.nodes)}
-            for world in (animation.world_matrices(self.nodes, time) for time in sorted(times)):
-                for node, matrix, moving in zip(self.nodes, world, self._moving, strict=True):
-                    for mesh in node.meshes if moving else ():
-                        boxes.extend(geometry.transform_points(matrix, _box_corners(mesh)))
-        return np.stack([np.min(boxes, axis=0), np.max(boxes, axis=0)]).astype(np.float32)
-
-
-def _box_corners(mesh: Mesh) -> np.ndarray:
-    """Return the corners [8, 3] of the box around a mesh's points, in the space of its node."""
-    box = np.stack([mesh.points.min(axis=0), mesh.points.max(axis=0)])
-    return np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(8, 3)
+            evenly = np.linspace(0.0, self.duration, POSES_FOR_BOUNDS)
+            swept = animation.swept_box(self.nodes, self._moving, evenly)
+            boxes += [swept] if np.isfinite(swept).all() else []
+        return np.stack([np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))]).astype(np.float32)
 
 
 def _device(device: str | wp.Device | None) -> wp.Device:

@@ -33,11 +33,16 @@ class MapSplit:
     cos_cones: np.ndarray
     cos_discs: np.ndarray
     share: float
+    nodes: tuple[np.ndarray, ...] = ()
+    """Texels of each sun, row * width + column, int [count]."""
 
 
-def split_map(pixels: np.ndarray, brighter_than: float, most: int) -> MapSplit:
+def split_map(
+    pixels: np.ndarray, brighter_than: float, most: int, least_share: float = LEAST_SHARE, widest: float = math.pi
+) -> MapSplit:
     """Return the suns of a map [height, width, 3] and the rest; ``Environment.split_sun`` says what counts as one.
 
+    Each holds ``least_share`` of the sky's light, and is not wider than a disc of half-angle ``widest`` [rad].
     A texel that is cut keeps its colour. Blobs touch at sides or corners, across the edge of the map, too, and a
     pole is one point that all of the next row touches.
     """
@@ -55,19 +60,17 @@ def split_map(pixels: np.ndarray, brighter_than: float, most: int) -> MapSplit:
     light = (bright.astype(np.float64) - cut) * areas[rows, None]
     blobs = _blobs(rows, columns, height, width)
     powers = np.bincount(blobs, light @ LUMINANCE)
-    suns = [k for k in np.argsort(-powers, kind="stable")[:most] if powers[k] >= LEAST_SHARE * whole]
-    if not suns:
-        return none
+    suns = [k for k in np.argsort(-powers, kind="stable") if powers[k] >= least_share * whole]
     rest = pixels.copy()
     theta, phi = rows * (math.pi / (height - 1)), (columns + 0.5) * (2 * math.pi / width)
     towards = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=-1)
     down, right = math.pi / (height - 1), 2 * math.pi / width
     step = math.hypot(down, right)  # a texel's light reaches to the next, every way; near a pole less far
     spreads = (down**2 + (right * np.sin(theta)) ** 2) / 6  # of a texel's own light
-    directions, irradiances, cones, discs = [], [], [], []
+    directions, irradiances, cones, discs, power = [], [], [], [], 0.0
+    nodes: list[np.ndarray] = []
     for k in suns:
         held = blobs == k
-        rest[rows[held], columns[held]] = cut[held]
         weights = light[held] @ LUMINANCE
         axis = weights @ towards[held]
         axis /= np.linalg.norm(axis)
@@ -75,12 +78,20 @@ def split_map(pixels: np.ndarray, brighter_than: float, most: int) -> MapSplit:
         cone = min(math.acos(cosines.min()) + step, math.pi)
         # the mean of sin^2 over an even disc is half that at its rim
         spread = 2 * (weights @ (1 - cosines**2 + spreads[held]) / weights.sum())
+        disc = max(math.sqrt(max(1 - spread, 0.0)), math.cos(cone))
+        if len(nodes) == most or disc < math.cos(widest):
+            continue
+        rest[rows[held], columns[held]] = cut[held]
+        nodes.append(rows[held] * width + columns[held])
+        power += powers[k]
         directions.append(axis)
         irradiances.append(light[held].sum(axis=0))
         cones.append(math.cos(cone))
-        discs.append(max(math.sqrt(max(1 - spread, 0.0)), cones[-1]))
-    share = float(powers[suns].sum() / whole)
-    return MapSplit(rest, np.array(directions), np.array(irradiances), np.array(cones), np.array(discs), share)
+        discs.append(disc)
+    if not nodes:
+        return none
+    towards_suns, shapes = (np.array(directions), np.array(irradiances)), (np.array(cones), np.array(discs))
+    return MapSplit(rest, *towards_suns, *shapes, float(power / whole), tuple(nodes))
 
 
 def _blobs(rows: np.ndarray, columns: np.ndarray, height: int, width: int) -> np.ndarray:

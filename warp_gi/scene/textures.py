@@ -13,7 +13,17 @@ from warp_gi.scene.model import Material, Texture
 
 WRAPS = {"repeat": types.WRAP_REPEAT, "clamp": types.WRAP_CLAMP, "mirror": types.WRAP_MIRROR}
 
-TEXTURE_SLOTS = ("base_color_texture", "metallic_roughness_texture", "normal_texture", "emission_texture")
+TEXTURE_SLOTS = (
+    "base_color_texture",
+    "metallic_roughness_texture",
+    "normal_texture",
+    "emission_texture",
+    "specular_texture",
+    "reflectance_texture",
+)
+
+
+NUMBERS = ("base_color", "alpha", "metallic", "roughness", "specular", "reflectance", "normal_scale", "emission")
 
 
 def check_texture(texture: Texture, owner: str) -> None:
@@ -29,6 +39,12 @@ def check_texture(texture: Texture, owner: str) -> None:
     for wrap in texture.wrap:
         if wrap not in WRAPS:
             raise SceneError(f"{name}: unknown wrap mode {wrap!r} (known: {', '.join(WRAPS)})")
+    if texture.uv_set not in (0, 1):
+        raise SceneError(f"{name}: uv_set must be 0 or 1, got {texture.uv_set!r}")
+    if texture.transform is not None:
+        rows = np.asarray(texture.transform, np.float64)
+        if rows.shape != (2, 3) or not np.isfinite(rows).all():
+            raise SceneError(f"{name}: transform must be two rows of 3 finite numbers, got {texture.transform!r}")
 
 
 def check_material(material: Material) -> None:
@@ -40,19 +56,23 @@ def check_material(material: Material) -> None:
         if not np.all((array >= low) & (array <= high)):
             raise SceneError(f"{owner}: {label} must be from {low:g} to {high:g}, got {values}")
 
-    for label, size in (("base_color", 3), ("emission", 3)):
+    for label, size in (("base_color", 3), ("emission", 3), ("reflectance", 3)):
         if np.shape(getattr(material, label)) != (size,):
             raise SceneError(f"{owner}: {label} must be {size} numbers, got {getattr(material, label)!r}")
     for label in ("base_color", "alpha", "metallic", "roughness", "specular"):
         within(label, getattr(material, label), 0.0, 1.0)
     within("emission", material.emission, 0.0, 1e30)
+    within("reflectance", material.reflectance, 0.0, 1e6)
     within("normal_scale", material.normal_scale, -1e6, 1e6)
     if material.alpha_cutoff is not None:
-        within("alpha_cutoff", material.alpha_cutoff, 0.0, 1.0)
+        within("alpha_cutoff", material.alpha_cutoff, 0.0, np.inf)
     for slot in TEXTURE_SLOTS:
         texture = getattr(material, slot)
         if texture is not None:
             check_texture(texture, owner)
+    base = material.base_color_texture
+    if base is not None and (base.uv_set or base.transform is not None):
+        raise SceneError(f"{owner}: a base_color_texture takes uv_set 0 and no transform; transform the mesh's uvs")
 
 
 def distinct_textures(materials: Sequence[Material]) -> list[Texture]:
@@ -82,7 +102,10 @@ def texture_table(textures: Sequence[Texture]) -> tuple[np.ndarray, np.ndarray]:
     for index, texture in enumerate(textures):
         height, width = texture.pixels.shape[:2]
         wrap_u, wrap_v = (WRAPS[wrap] for wrap in texture.wrap)
-        table[index] = (start_of[id(texture.pixels)], width, height, wrap_u, wrap_v, int(texture.srgb))
+        rows = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)) if texture.transform is None else texture.transform
+        moved = texture.uv_set != 0 or texture.transform is not None
+        how = int(texture.srgb), int(texture.nearest), texture.uv_set, int(moved)
+        table[index] = (start_of[id(texture.pixels)], width, height, wrap_u, wrap_v, *how, *rows)
     return table, texels
 
 
@@ -91,14 +114,25 @@ def material_table(materials: Sequence[Material], textures: Sequence[Texture]) -
     index_of = {id(texture): index for index, texture in enumerate(textures)}
     table = np.zeros(len(materials), types.Material.numpy_dtype())
     for row, material in zip(table, materials, strict=True):
-        for label in ("base_color", "alpha", "metallic", "roughness", "specular", "normal_scale", "emission"):
+        for label in NUMBERS:
             row[label] = getattr(material, label)
         row["alpha_cutoff"] = -1.0 if material.alpha_cutoff is None else material.alpha_cutoff
         row["double_sided"] = int(material.double_sided)
+        row["colors_emit"] = int(material.colors_emit)
         for slot in TEXTURE_SLOTS:
             texture = getattr(material, slot)
             row[slot] = -1 if texture is None else index_of[id(texture)]
     return table
+
+
+def texture_coordinates(texture: Texture, uvs: np.ndarray, further_uvs: np.ndarray | None) -> np.ndarray:
+    """Return where a texture is looked up at vertices with these two sets of coordinates [..., 2]."""
+    if texture.uv_set:
+        uvs = np.zeros_like(uvs) if further_uvs is None else further_uvs
+    if texture.transform is None:
+        return uvs
+    rows = np.asarray(texture.transform, np.float64)
+    return uvs @ rows[:, :2].T + rows[:, 2]
 
 
 def linear_rgb(texture: Texture) -> np.ndarray:

@@ -1,6 +1,8 @@
-"""EXR files with named layers and metadata, through OpenImageIO.
+"""EXR files with named layers and metadata: written by OpenEXR itself, read through OpenImageIO.
 
-One part, scan lines, ZIP. Layers follow the usual names: ``R G B`` for the picture, ``A`` for its coverage,
+OpenImageIO writes the same files in twice the time: where some channels are half and others float, it converts them one
+by one, pixel by pixel. One part, scan lines, ZIP. Layers follow the usual names: ``R G B`` for the picture, ``A`` for
+its coverage,
 ``N.X``, ``P.X``, ``Z``, ``motion.u``, ``albedo.R`` and so on. Colours and normals are
 half unless a value is past half's range; positions, depth, motion, identifiers and
 variance are float. No capture date is written, so equal frames are equal files.
@@ -8,15 +10,20 @@ variance are float. No capture date is written, so equal frames are equal files.
 
 from __future__ import annotations
 
+import os
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from warp_gi import launch
 from warp_gi.errors import OptionError, SceneError, one_line
 
 HALF_MAX = 65504.0
+
+_writing = threading.Lock()  # OpenEXR's number of threads is one for all files; taken across a fork
 
 Attribute = str | int | float | np.ndarray
 
@@ -54,6 +61,8 @@ def stored_format(buffer: str, values: np.ndarray, precision: str = "half") -> s
     """Return "half" or "float", the format ``buffer`` is stored in."""
     if precision == "float" or buffer in _ALWAYS_FLOAT:
         return "float"
+    if values.size and values.max() <= HALF_MAX and values.min() >= -HALF_MAX:  # nothing is NaN or infinite
+        return "half"
     finite = values[np.isfinite(values)]
     return "float" if finite.size and np.abs(finite).max() > HALF_MAX else "half"
 
@@ -89,48 +98,40 @@ def write_exr(
     ``precision`` is "half" or "float" for the buffers that may be either.
     Raises OSError when the file cannot be written, OptionError for buffers of unequal size.
     """
-    import OpenImageIO as oiio
+    import OpenEXR
 
     if precision not in ("half", "float"):
         raise OptionError(f"EXR precision must be 'half' or 'float', got {precision!r}")
-    names: list[str] = []
-    formats: list[str] = []
-    planes: list[np.ndarray] = []
+    channels: dict[str, np.ndarray] = {}
+    size: tuple[int, ...] = ()
     for buffer, values in buffers.items():
         values = np.asarray(values)
         if buffer in _INTEGER and values.size and np.abs(values).max() > 2**24:
             raise OptionError(f"buffer {buffer!r} has identifiers above 2^24, which an EXR float cannot hold")
-        values = stored_values(buffer, values, precision)
+        values = np.asarray(values, dtype=np.float32)
         values = values.reshape(*values.shape[:2], -1)
-        if planes and values.shape[:2] != planes[0].shape[:2]:
-            raise OptionError(f"buffer {buffer!r} is {values.shape[:2]}, the others are {planes[0].shape[:2]}")
-        names += channel_names(buffer, values.shape[2])
-        formats += [stored_format(buffer, values, precision)] * values.shape[2]
-        planes.append(values)
-    if not planes:
+        size = size or values.shape[:2]
+        if values.shape[:2] != size:
+            raise OptionError(f"buffer {buffer!r} is {values.shape[:2]}, the others are {size}")
+        dtype = np.float16 if stored_format(buffer, values, precision) == "half" else np.float32
+        planes = np.ascontiguousarray(np.moveaxis(values, 2, 0), dtype=dtype)
+        channels |= dict(zip(channel_names(buffer, len(planes)), planes, strict=True))
+    if not channels:
         raise OptionError("an EXR file needs at least one buffer")
-    pixels = np.ascontiguousarray(np.concatenate(planes, axis=2))
-    height, width, count = pixels.shape
-    spec = oiio.ImageSpec(width, height, count, "float")
-    spec.channelnames = tuple(names)
-    spec.channelformats = tuple(formats)
-    spec.attribute("compression", "zip")
-    spec.attribute("DateTime", "")  # without it the time of day goes into every file
+    header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     for name, value in attributes.items():
-        if isinstance(value, np.ndarray):
-            kind = oiio.TypeDesc(_ARRAYS[value.size])
-            spec.attribute(name, kind, tuple(float(v) for v in value.reshape(-1)))
-        else:
-            spec.attribute(name, plain(value))
-    output = oiio.ImageOutput.create("exr")
-    if output is None:
-        raise OSError(f"cannot write {path}: {one_line(oiio.geterror(), 'OpenImageIO has no writer of EXR files')}")
-    written = output.open(str(path), spec) and output.write_image(pixels)
-    problem = output.geterror()
-    closed = output.close()
-    if not written or not closed or problem:
-        problem = one_line(problem or output.geterror(), "unknown failure")
-        raise OSError(f"cannot write {path}: {problem}")
+        is_matrix = isinstance(value, np.ndarray)
+        header[name] = np.ascontiguousarray(value, np.float32) if is_matrix else plain(value)  # OpenEXR ignores strides
+    threads = launch.thread_count()
+    with _writing:
+        try:
+            OpenEXR.set_global_thread_count(threads if threads > 1 else 0)
+            with OpenEXR.File(header, channels) as file:
+                file.write(str(path))
+        except RuntimeError as error:
+            raise OSError(f"cannot write {path}: {one_line(str(error), 'unknown failure')}") from error
+        finally:
+            OpenEXR.set_global_thread_count(0)  # a forked process would wait for threads that only its parent has
 
 
 def read_exr(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Attribute], dict[str, str]]:
@@ -179,3 +180,7 @@ def _buffer_of(channel: str) -> str:
     if channel in _BUFFER_OF_CHANNEL:
         return _BUFFER_OF_CHANNEL[channel]
     return channel.rpartition(".")[0] or channel
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_writing.acquire, after_in_parent=_writing.release, after_in_child=_writing.release)

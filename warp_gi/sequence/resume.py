@@ -182,7 +182,7 @@ class SequenceRun:
     def bake(self) -> None:
         """Bake under the sky of the sequence's first frame, so that a resumed sequence has the same bake."""
         with self.scheduler.scene.lock:
-            self.scheduler.bake(self.shots[0].time)
+            self.scheduler.bake(self.shots[0].time, len(self.shots))
 
     @cached_property
     def dependence(self) -> Dependence:
@@ -239,11 +239,11 @@ class SequenceRun:
 
     def render(self, shot: Shot) -> Frame:
         """Render a frame of the plan's ``todo`` and write its file; the time it took is the frame's timing "write"."""
-        remove_stale_parts(shot.path)
         frame = self.scheduler.frame(shot.index, shot.previous)
         if shot.lineage:
             frame.metadata["lineage"] = shot.lineage
         started = time.perf_counter()
+        remove_stale_parts(shot.path)
         self.output.write(frame, shot.path)
         frame.timings["write"] = time.perf_counter() - started
         return frame

@@ -1,190 +1,216 @@
 """glTF 2.0 and GLB files: hierarchy, meshes, materials, cameras, punctual lights and node animation.
 
-What the format has and this reader does not use (skins, morph targets, vertex colours,
-orthographic cameras, unknown extensions) is left out; unknown extensions that a file
-requires are an error. ``alphaMode`` BLEND becomes a mask with a cutoff of 0.5. Intensities
-of punctual lights are taken as radiometric numbers (W/sr, W/m^2) without conversion.
+What becomes of each feature of the format is in the table of ``support.py``. What a file uses and is not read in
+full is noted there; unknown extensions that a file requires are an error.
 """
 
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pygltflib
 
 from warp_gi.errors import OptionError, SceneError
 from warp_gi.scene.animation import moving_nodes, pose_matrix, world_matrices
 from warp_gi.scene.files.gltf_animation import read_keyframes
 from warp_gi.scene.files.gltf_buffers import Buffers, split_glb
-from warp_gi.scene.files.gltf_materials import MaterialReader, texture_transform
+from warp_gi.scene.files.gltf_document import Document, Part
+from warp_gi.scene.files.gltf_meshes import MeshReader
 from warp_gi.scene.files.parts import SceneParts
-from warp_gi.scene.model import Mesh, Node, PunctualLight
+from warp_gi.scene.files.support import BY_NAME
+from warp_gi.scene.model import Node, PunctualLight
 from warp_gi.scene.pinhole import Camera
 
-KNOWN_EXTENSIONS = {
-    "KHR_lights_punctual",
-    "KHR_materials_emissive_strength",
-    "KHR_materials_specular",
-    "KHR_mesh_quantization",
-    "KHR_texture_transform",
-}
 CAMERA_HEIGHT = 540  # pixels; a glTF camera has a shape but no resolution
-TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN = 4, 5, 6
 
 
 def read_gltf(path: Path) -> SceneParts:
     """Read a .glb or .gltf file; raises SceneError."""
     data = path.read_bytes()
     text, binary = split_glb(memoryview(data), path) if path.suffix.lower() == ".glb" else (data, None)
-    document = pygltflib.GLTF2.from_json(text.decode("utf-8-sig"), infer_missing=True)
-    unknown = sorted(set(document.extensionsRequired or ()) - KNOWN_EXTENSIONS)
+    document = Document(text, path)
+    _check_extensions(document)
+    return _Reader(document, Buffers(document, binary)).parts()
+
+
+def _check_extensions(document: Document) -> None:
+    """Raise SceneError for required extensions that are not supported, and note others that are not read in full."""
+    read = {name for name, one in BY_NAME.items() if one.status in ("supported", "approximated")}
+    unknown = sorted({str(name) for name in document.root.get("extensionsRequired") or ()} - read)
     if unknown:
-        raise SceneError(f"{str(path)!r} requires {', '.join(unknown)}, which is not supported; export it without")
-    return _Reader(document, Buffers(document, path, binary), path).parts()
+        raise SceneError(
+            f"{str(document.path)!r} requires {', '.join(unknown)}, which is not supported; export it without"
+        )
+    for name, places in document.used_extensions().items():
+        feature = BY_NAME.get(name)
+        if feature is not None and feature.status in ("supported", "refused"):
+            continue  # a file that can do without what is refused has other data beside it
+        for place in places or ("",):
+            document.findings.add(name, place)
 
 
 class _Reader:
-    def __init__(self, document: pygltflib.GLTF2, buffers: Buffers, path: Path) -> None:
-        self.document, self.buffers, self.path = document, buffers, path
-        self.materials = MaterialReader(document, buffers)
-        self.meshes: dict[int, list[Mesh]] = {}
+    def __init__(self, document: Document, buffers: Buffers) -> None:
+        self.document, self.buffers, self.path = document, buffers, document.path
+        self.meshes = MeshReader(document, buffers)
 
     def parts(self) -> SceneParts:
         """Return nodes in depth-first order, with what hangs on them."""
         keyframes = read_keyframes(self.document, self.buffers)
         nodes: list[Node] = []
-        sources: list[pygltflib.Node] = []
-        names: set[str] = set()
-        pending: list[tuple[int, int | None]] = [(index, None) for index in reversed(self._roots())]
+        sources: list[tuple[Part, str]] = []
+        names = _Names()
+        pending: list[tuple[int, int | None, str]] = [(index, None, "the scene") for index in reversed(self._roots())]
         seen: set[int] = set()
         while pending:
-            index, parent = pending.pop()
+            index, parent, owner = pending.pop()
+            source = self.document.item("nodes", index, owner)
             if index in seen:
                 raise SceneError(f"{str(self.path)!r}: node {index} hangs on two parents or on itself")
             seen.add(index)
-            source = self.document.nodes[index]
-            name = _unique(source.name or f"node {index}", names)
-            meshes = self._mesh(source.mesh) if source.mesh is not None else []
-            pending.extend((child, len(nodes)) for child in reversed(source.children or []))
-            nodes.append(Node(name, list(meshes), _local_matrix(source), parent, keyframes.get(index)))
-            sources.append(source)
+            owner = self.document.name("nodes", index)
+            children = self.document.indices(source, "children", owner)
+            pending.extend((child, len(nodes), owner) for child in reversed(children))
+            sources.append((source, owner))
+            nodes.append(self._node(source, owner, names, parent))
+            nodes[-1].keyframes = keyframes.get(index)
+            for copy in self._instances(source, owner, nodes[-1], names, len(nodes) - 1):
+                nodes.append(copy)
+                sources.append(({}, owner))
         return self._with_lights_and_cameras(nodes, sources)
 
+    def _node(self, source: Part, owner: str, names: _Names, parent: int | None) -> Node:
+        document = self.document
+        weights = source.get("weights")
+        if weights is not None:
+            weights = document.numbers(source, "weights", owner, [0.0] * len(weights))
+        if source.get("skin") is not None:
+            document.findings.add("skins", owner)
+        meshes = []
+        if source.get("mesh") is not None:
+            meshes = list(self.meshes.meshes(document.whole(source, "mesh", owner), owner, weights))
+        return Node(names.unique(document.text(source, "name") or owner), meshes, self._matrix(source, owner), parent)
+
+    def _instances(self, source: Part, owner: str, node: Node, names: _Names, index: int) -> list[Node]:
+        """Return the copies of a node's meshes that EXT_mesh_gpu_instancing asks for, and take them from the node."""
+        extension = self.document.extension(source, "EXT_mesh_gpu_instancing", owner)
+        if extension is None or not node.meshes:
+            return []
+        given = self.document.part(extension, "attributes", owner) or {}
+        widths = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}
+        values = {
+            name: self.buffers.accessor(given[name], f"{name} of {owner}", (width,))
+            for name, width in widths.items()
+            if given.get(name) is not None
+        }
+        counts = {len(one) for one in values.values()}
+        if len(counts) > 1:
+            raise self.document.error(owner, f"its instances have {' and '.join(map(str, sorted(counts)))} values")
+        count = counts.pop() if counts else 0
+        rest = {"TRANSLATION": (0.0,) * 3, "ROTATION": (0.0, 0.0, 0.0, 1.0), "SCALE": (1.0,) * 3}
+        matrices = pose_matrix(*(values.get(name, np.tile(one, (count, 1))) for name, one in rest.items()))
+        meshes, node.meshes = node.meshes, []
+        return [Node(names.unique(f"{node.name} {i + 1}"), list(meshes), one, index) for i, one in enumerate(matrices)]
+
+    def _matrix(self, source: Part, owner: str) -> np.ndarray:
+        if source.get("matrix") is not None:
+            values = self.document.numbers(source, "matrix", owner, (0.0,) * 16)
+            return np.array(values, np.float64).reshape(4, 4).T
+        rest = {"translation": (0.0,) * 3, "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0,) * 3}
+        if not rest.keys() & source.keys():
+            return np.eye(4)
+        translation, rotation, scale = (self.document.numbers(source, key, owner, one) for key, one in rest.items())
+        if not any(rotation):
+            raise self.document.error(owner, "rotation must be a unit quaternion, got zeros")
+        return pose_matrix(translation, rotation, scale)
+
     def _roots(self) -> list[int]:
-        scenes = self.document.scenes
+        scenes = self.document.items("scenes")
+        if len(scenes) > 1:
+            self.document.findings.add("further scenes")
         if scenes:
-            return list(scenes[self.document.scene or 0].nodes or [])
-        children = {child for node in self.document.nodes for child in node.children or []}
-        return [index for index in range(len(self.document.nodes)) if index not in children]
+            number = self.document.whole(self.document.root, "scene", "the file", 0)
+            return self.document.indices(self.document.item("scenes", number, "the file"), "nodes", f"scene {number}")
+        nodes = self.document.items("nodes")
+        children = {
+            child for i, node in enumerate(nodes) for child in self.document.indices(node, "children", f"node {i}")
+        }
+        return [index for index in range(len(nodes)) if index not in children]
 
-    def _mesh(self, index: int) -> list[Mesh]:
-        if index not in self.meshes:
-            source = self.document.meshes[index]
-            name = source.name or f"mesh {index}"
-            meshes = (self._primitive(primitive, name) for primitive in source.primitives)
-            self.meshes[index] = [mesh for mesh in meshes if mesh is not None]
-        return self.meshes[index]
-
-    def _primitive(self, source: pygltflib.Primitive, name: str) -> Mesh | None:
-        """Return one primitive as a mesh, or None if it is not made of triangles."""
-        mode = TRIANGLES if source.mode is None else source.mode
-        position = getattr(source.attributes, "POSITION", None)
-        if mode not in (TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN) or position is None:
-            return None
-        points = np.ascontiguousarray(self.buffers.accessor(position), np.float32)
-        corners = np.arange(len(points)) if source.indices is None else self.buffers.accessor(source.indices)
-        if mode == TRIANGLES and len(corners) % 3:
-            raise SceneError(f"{str(self.path)!r}: mesh {name!r} has {len(corners)} indices, not a multiple of 3")
-        uvs = None
-        if source.material is not None:
-            coordinates, transform = texture_transform(self.document.materials[source.material])
-            accessor = getattr(source.attributes, f"TEXCOORD_{coordinates}", None)
-            if accessor is not None:
-                uvs = self.buffers.accessor(accessor) @ transform[:2, :2].T.astype(np.float32) + transform[:2, 2]
-                uvs = np.stack([uvs[:, 0], 1.0 - uvs[:, 1]], axis=1).astype(np.float32)
-        normal = getattr(source.attributes, "NORMAL", None)
-        return Mesh(
-            points,
-            _triangles(corners.astype(np.int64), mode),
-            self.materials.material(source.material),
-            None if normal is None else np.ascontiguousarray(self.buffers.accessor(normal), np.float32),
-            uvs,
-            name,
-        )
-
-    def _with_lights_and_cameras(self, nodes: list[Node], sources: list[pygltflib.Node]) -> SceneParts:
-        parts = SceneParts(nodes)
+    def _with_lights_and_cameras(self, nodes: list[Node], sources: list[tuple[Part, str]]) -> SceneParts:
+        document = self.document
+        parts = SceneParts(nodes, findings=document.findings)
         moving, world = moving_nodes(nodes), world_matrices(nodes, 0.0)
-        described = (self.document.extensions or {}).get("KHR_lights_punctual", {}).get("lights", [])
-        for index, source in enumerate(sources):
-            extension = (source.extensions or {}).get("KHR_lights_punctual")
+        described = (document.extension(document.root, "KHR_lights_punctual", "the file") or {}).get("lights", [])
+        names = _Names()
+        for index, (source, owner) in enumerate(sources):
+            extension = document.extension(source, "KHR_lights_punctual", owner)
             if extension is not None:
-                light = _light(described[extension["light"]], nodes[index].name)
+                number = document.whole(extension, "light", owner)
+                if number >= len(described):
+                    raise document.error(owner, f"names light {number}, and the file has {len(described)} lights")
+                light = self._light(described[number], nodes[index].name)
                 parts.lights.append(replace(light, node=index) if moving[index] else _placed(light, world[index]))
-            if source.camera is not None and self.document.cameras[source.camera].perspective is not None:
-                lens = self.document.cameras[source.camera].perspective
-                aspect = lens.aspectRatio or 16.0 / 9.0
-                hfov = 2.0 * math.degrees(math.atan(math.tan(lens.yfov / 2.0) * aspect))
-                name = self.document.cameras[source.camera].name or nodes[index].name
-                name = _unique(name, set(parts.cameras))
-                resolution = (max(1, round(CAMERA_HEIGHT * aspect)), CAMERA_HEIGHT)
-                try:
-                    parts.cameras[name] = Camera(world[index], hfov, resolution, name)
-                except OptionError as error:
-                    warnings.warn(f"{str(self.path)!r}: {error}; it is left out", stacklevel=2)
-                    continue
-                parts.camera_nodes[name] = index
+            if source.get("camera") is not None:
+                camera = self._camera(document.whole(source, "camera", owner), owner, world[index], nodes[index].name)
+                if camera is not None:
+                    name = names.unique(camera.name)
+                    parts.cameras[name] = replace(camera, name=name)
+                    parts.camera_nodes[name] = index
         return parts
 
+    def _camera(self, index: int, owner: str, world_from_node: np.ndarray, node: str) -> Camera | None:
+        document = self.document
+        source = document.item("cameras", index, owner)
+        what = document.name("cameras", index)
+        lens = document.part(source, "perspective", what)
+        if lens is None:
+            document.findings.add("orthographic cameras", what)
+            return None
+        aspect = document.number(lens, "aspectRatio", what, 16.0 / 9.0)
+        vfov = document.number(lens, "yfov", what)
+        hfov = 2.0 * math.degrees(math.atan(math.tan(vfov / 2.0) * aspect))
+        resolution = (max(1, round(CAMERA_HEIGHT * aspect)), CAMERA_HEIGHT)
+        name = document.text(source, "name") or node
+        try:
+            return Camera(world_from_node, hfov, resolution, name, keeps_vertical=lens.get("aspectRatio") is None)
+        except OptionError as error:
+            document.findings.lost.append(f"{str(self.path)!r}: {error}; it is left out")
+            return None
 
-def _unique(name: str, taken: set[str]) -> str:
-    """Return ``name``, with a number if it is taken, and take it."""
-    result, number = name, 1
-    while result in taken:
-        number += 1
-        result = f"{name} {number}"
-    taken.add(result)
-    return result
+    def _light(self, source: Part, node: str) -> PunctualLight:
+        document = self.document
+        name = document.text(source, "name") or node
+        owner = f"light {name!r}"
+        strength = document.number(source, "intensity", owner, 1.0)
+        red, green, blue = (strength * x for x in document.numbers(source, "color", owner, (1.0,) * 3))
+        spot = document.part(source, "spot", owner) or {}
+        return PunctualLight(
+            document.text(source, "type") or "point",
+            (red, green, blue),
+            inner_cone=document.number(spot, "innerConeAngle", owner, 0.0),
+            outer_cone=document.number(spot, "outerConeAngle", owner, math.pi / 4),
+            range=None if source.get("range") is None else document.number(source, "range", owner),
+            name=name,
+        )
 
 
-def _local_matrix(source: pygltflib.Node) -> np.ndarray:
-    if source.matrix:
-        return np.array(source.matrix, np.float64).reshape(4, 4).T
-    rest = (source.translation or (0.0,) * 3, source.rotation or (0.0, 0.0, 0.0, 1.0), source.scale or (1.0,) * 3)
-    return pose_matrix(*rest)
+class _Names:
+    """Gives each part a name of its own."""
 
+    def __init__(self) -> None:
+        self.taken: dict[str, int] = {}
 
-def _triangles(corners: np.ndarray, mode: int) -> np.ndarray:
-    """Return int32 [triangle, 3] of a list, strip or fan of vertices."""
-    if mode == TRIANGLES:
-        return corners.reshape(-1, 3).astype(np.int32)
-    count = max(len(corners) - 2, 0)
-    first = np.arange(count)
-    if mode == TRIANGLE_FAN:
-        rows = np.stack([first + 1, first + 2, np.zeros_like(first)], axis=1)
-    else:
-        odd = first % 2
-        rows = np.stack([first, first + 1 + odd, first + 2 - odd], axis=1)
-    return corners[rows].reshape(-1, 3).astype(np.int32)
-
-
-def _light(source: Mapping[str, Any], name: str) -> PunctualLight:
-    intensity = tuple(float(x) * source.get("intensity", 1.0) for x in source.get("color", (1.0, 1.0, 1.0)))
-    spot = source.get("spot", {})
-    return PunctualLight(
-        source.get("type", "point"),
-        intensity,
-        inner_cone=spot.get("innerConeAngle", 0.0),
-        outer_cone=spot.get("outerConeAngle", math.pi / 4),
-        range=source.get("range"),
-        name=source.get("name") or name,
-    )
+    def unique(self, name: str) -> str:
+        """Return ``name``, with a number if it is taken, and take it."""
+        result = name
+        while result in self.taken:
+            self.taken[name] += 1
+            result = f"{name} {self.taken[name]}"
+        self.taken[result] = 1
+        return result
 
 
 def _placed(light: PunctualLight, world_from_node: np.ndarray) -> PunctualLight:

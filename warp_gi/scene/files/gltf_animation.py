@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-import pygltflib
 
 from warp_gi.scene.animation import slerp
 from warp_gi.scene.files.gltf_buffers import Buffers
+from warp_gi.scene.files.gltf_document import Document, Part
 from warp_gi.scene.model import Keyframe
 
 CUBIC_STEPS = 16  # linear pieces that a cubic spline becomes between two of its keys
+WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}
 STEP_SECONDS = 1e-5  # how long before its next key a STEP value is last held
 
 
@@ -32,47 +33,81 @@ class _Channel:
             return list(np.interp(steps, np.arange(len(self.times)), self.times))
         return list(self.times)
 
-    def value(self, time: float) -> np.ndarray:
-        """Return the property at ``time`` [s]."""
-        after = int(np.searchsorted(self.times, time, side="right"))
-        if after == 0 or after == len(self.times) or self.interpolation == "STEP":
-            return self.values[max(after - 1, 0)]
-        span = self.times[after] - self.times[after - 1]
-        t = (time - self.times[after - 1]) / span
-        a, b = self.values[after - 1], self.values[after]
+    def values_at(self, times: np.ndarray) -> np.ndarray:
+        """Return the property at ``times`` [s], float64 [time, width]."""
+        after = np.searchsorted(self.times, times, side="right")
+        before = np.maximum(after - 1, 0)
+        if self.interpolation == "STEP" or len(self.times) == 1:
+            return self.values[before]
+        last = len(self.times) - 1
+        after = np.minimum(np.maximum(after, 1), last)
+        start = after - 1
+        span = (self.times[after] - self.times[start])[:, None]
+        t = np.clip((times - self.times[start])[:, None] / span, 0.0, 1.0)
+        a, b = self.values[start], self.values[after]
         if self.tangents is not None:
-            out, into = span * self.tangents[after - 1, 2], span * self.tangents[after, 0]
+            out, into = span * self.tangents[start, 2], span * self.tangents[after, 0]
             t2, t3 = t * t, t * t * t
             return (2 * t3 - 3 * t2 + 1) * a + (t3 - 2 * t2 + t) * out + (3 * t2 - 2 * t3) * b + (t3 - t2) * into
         return slerp(a, b, t) if self.is_rotation else (1.0 - t) * a + t * b
 
 
-def read_keyframes(document: pygltflib.GLTF2, buffers: Buffers) -> dict[int, list[Keyframe]]:
+def read_keyframes(document: Document, buffers: Buffers) -> dict[int, list[Keyframe]]:
     """Return the keyframes of each animated node; where several animations move one property, the first counts."""
     channels: dict[int, dict[str, _Channel]] = {}
-    for animation in document.animations:
-        for channel in animation.channels:
-            node, path = channel.target.node, channel.target.path
-            if node is None or path not in ("translation", "rotation", "scale"):
+    animations = document.items("animations")
+    if len(animations) > 1:
+        document.findings.add("several animations")
+    for index, animation in enumerate(animations):
+        name = document.name("animations", index)
+        samplers = animation.get("samplers") or []
+        for channel in animation.get("channels") or ():
+            target = document.part(channel, "target", name) or {}
+            path = target.get("path")
+            if target.get("node") is None or path not in WIDTHS:
+                if path == "weights":
+                    document.findings.add("animation of morph weights", name)
                 continue
-            sampler = animation.samplers[channel.sampler]
-            times, values = buffers.accessor(sampler.input), buffers.accessor(sampler.output)
-            if len(times) and path not in channels.setdefault(node, {}):
-                kind = sampler.interpolation or "LINEAR"
-                channels[node][path] = _Channel(times, values, kind, path == "rotation")
-    return {node: _merge(document.nodes[node], paths) for node, paths in channels.items() if paths}
+            node = document.whole(target, "node", name)
+            document.item("nodes", node, name)
+            if path in channels.setdefault(node, {}):
+                continue
+            number = document.whole(channel, "sampler", name)
+            if number >= len(samplers):
+                raise document.error(name, f"names sampler {number}, and it has {len(samplers)}")
+            found = _channel(document, buffers, samplers[number], path, name)
+            if found is not None:
+                channels[node][path] = found
+    return {node: _merge(document, node, paths) for node, paths in channels.items() if paths}
 
 
-def _merge(node: pygltflib.Node, channels: dict[str, _Channel]) -> list[Keyframe]:
+def _channel(document: Document, buffers: Buffers, sampler: Part, path: str, name: str) -> _Channel | None:
+    """Return one animated property; None if it has no keys."""
+    times = buffers.accessor(sampler.get("input"), name, (1,))
+    values = buffers.accessor(sampler.get("output"), name, (WIDTHS[path],))
+    kind = sampler.get("interpolation") or "LINEAR"
+    if kind not in ("LINEAR", "STEP", "CUBICSPLINE"):
+        raise document.error(name, f"interpolation must be LINEAR, STEP or CUBICSPLINE, got {kind!r:.60}")
+    needed = len(times) * (3 if kind == "CUBICSPLINE" else 1)
+    if len(values) != needed:
+        raise document.error(name, f"has {len(times)} times and {len(values)} values of {path}; expected {needed}")
+    if len(times) and not (np.isfinite(times).all() and np.isfinite(values).all() and (np.diff(times) > 0.0).all()):
+        raise document.error(name, f"the times of {path} must rise, and all numbers be finite")
+    return _Channel(times, values, kind, path == "rotation") if len(times) else None
+
+
+def _merge(document: Document, index: int, channels: dict[str, _Channel]) -> list[Keyframe]:
     """Return keyframes at all times of the node's channels; a property without one keeps its value at rest."""
+    node, owner = document.items("nodes")[index], document.name("nodes", index)
     rest = {
-        "translation": np.array(node.translation or (0.0, 0.0, 0.0)),
-        "rotation": np.array(node.rotation or (0.0, 0.0, 0.0, 1.0)),
-        "scale": np.array(node.scale or (1.0, 1.0, 1.0)),
+        "translation": np.array(document.numbers(node, "translation", owner, (0.0, 0.0, 0.0))),
+        "rotation": np.array(document.numbers(node, "rotation", owner, (0.0, 0.0, 0.0, 1.0))),
+        "scale": np.array(document.numbers(node, "scale", owner, (1.0, 1.0, 1.0))),
     }
-    times = sorted({time for channel in channels.values() for time in channel.key_times()})
-    keyframes = []
-    for time in times:
-        pose = {path: channels[path].value(time) if path in channels else value for path, value in rest.items()}
-        keyframes.append(Keyframe(float(time), **{path: tuple(value.tolist()) for path, value in pose.items()}))
-    return keyframes
+    times = np.unique(np.concatenate([channel.key_times() for channel in channels.values()]))
+    poses = {
+        path: channels[path].values_at(times) if path in channels else np.tile(value, (len(times), 1))
+        for path, value in rest.items()
+    }
+    rows = zip(times.tolist(), *(map(tuple, poses[path].tolist()) for path in rest), strict=True)
+    return [Keyframe(*row) for row in rows]

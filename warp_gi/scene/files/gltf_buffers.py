@@ -9,13 +9,14 @@ import urllib.parse
 from pathlib import Path
 
 import numpy as np
-import pygltflib
 
 from warp_gi.errors import SceneError
+from warp_gi.scene.files.gltf_document import Document, Part
 from warp_gi.scene.files.images import find_file
 
 COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+LARGEST_EMPTY = 1 << 28  # numbers; an accessor without data is all zero
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
 
@@ -57,73 +58,110 @@ def decode_data_uri(uri: str) -> bytes:
 
 
 class Buffers:
-    """Reads accessors and buffer views of one document (a pygltflib GLTF2)."""
+    """Reads accessors and buffer views of one document."""
 
-    def __init__(self, document: pygltflib.GLTF2, path: Path, binary: memoryview | None) -> None:
-        self.document, self.path, self.binary = document, path, binary
+    def __init__(self, document: Document, binary: memoryview | None) -> None:
+        self.document, self.path, self.binary = document, document.path, binary
         self._loaded: dict[int, memoryview] = {}
 
-    def buffer(self, index: int) -> memoryview:
+    def buffer(self, index: int, owner: str) -> memoryview:
         """Return the bytes of a buffer; raises SceneError if its file is missing or short."""
         if index not in self._loaded:
-            description = self.document.buffers[index]
-            if description.uri is None:
+            description = self.document.item("buffers", index, owner)
+            length = self.document.whole(description, "byteLength", f"buffer {index}")
+            uri = description.get("uri")
+            if uri is None:
                 if self.binary is None:
-                    raise SceneError(f"{str(self.path)!r}: buffer {index} has no data")
+                    raise self.document.error(f"buffer {index}", "has neither a uri nor a binary chunk")
                 data = self.binary
-            elif description.uri.startswith("data:"):
-                data = memoryview(decode_data_uri(description.uri))
+            elif not isinstance(uri, str):
+                raise self.document.error(f"buffer {index}", f"uri must be a text, got {uri!r:.60}")
+            elif uri.startswith("data:"):
+                data = memoryview(decode_data_uri(uri))
             else:
-                name = urllib.parse.unquote(description.uri)
+                name = urllib.parse.unquote(uri)
                 data = memoryview(find_file(self.path.parent, name, f"{str(self.path)!r}: buffer file").read_bytes())
-            if len(data) < description.byteLength:
+            if len(data) < length:
                 raise SceneError(
-                    f"{str(self.path)!r}: buffer {index} is truncated: it should have {description.byteLength} bytes"
+                    f"{str(self.path)!r}: buffer {index} is truncated: it should have {length} bytes"
                     f" and has {len(data)}"
                 )
             self._loaded[index] = data
         return self._loaded[index]
 
-    def view(self, index: int) -> memoryview:
+    def view(self, index: object, owner: str) -> memoryview:
         """Return the bytes of a buffer view."""
-        view = self.document.bufferViews[index]
-        start = view.byteOffset or 0
-        data = self.buffer(view.buffer)
-        if start + view.byteLength > len(data):
-            raise SceneError(f"{str(self.path)!r}: buffer view {index} passes the end of its buffer")
-        return data[start : start + view.byteLength]
+        view = self.document.item("bufferViews", index, owner)
+        name = f"buffer view {index}"
+        start = self.document.whole(view, "byteOffset", name, 0)
+        length = self.document.whole(view, "byteLength", name)
+        data = self.buffer(self.document.whole(view, "buffer", name), name)
+        if start + length > len(data):
+            raise SceneError(
+                f"{str(self.path)!r}: {name} passes the end of its buffer:"
+                f" it ends at byte {start + length} of {len(data)}"
+            )
+        return data[start : start + length]
 
-    def accessor(self, index: int) -> np.ndarray:
-        """Return an accessor as [count] or [count, width]; normalized integers as float32 in -1 to 1."""
-        description = self.document.accessors[index]
-        dtype, width = np.dtype(COMPONENTS[description.componentType]), WIDTHS[description.type]
-        count = description.count
-        if description.bufferView is None:
+    def accessor(self, index: object, owner: str, widths: tuple[int, ...] = ()) -> np.ndarray:
+        """Return an accessor as [count] or [count, width]; normalized integers as float32 in -1 to 1.
+
+        ``owner`` is what asks for it, for messages; ``widths`` are the numbers of components that it can use.
+        """
+        document, name = self.document, f"accessor {index}"
+        description = document.item("accessors", index, owner)
+        dtype = self._component(description, name)
+        kind = description.get("type")
+        if kind not in WIDTHS:
+            raise document.error(name, f"type must be one of {', '.join(WIDTHS)}, got {kind!r}")
+        width = WIDTHS[kind]
+        if widths and width not in widths:
+            raise document.error(owner, f"{name} is {kind}, and has to have {' or '.join(map(str, widths))} components")
+        count = document.whole(description, "count", name)
+        if description.get("bufferView") is None:
+            if count * width > LARGEST_EMPTY:
+                raise document.error(name, f"has {count} elements and no data")
             values = np.zeros((count, width), dtype)
         else:
-            offset = description.byteOffset or 0
-            stride = self.document.bufferViews[description.bufferView].byteStride
-            values = self._read(description.bufferView, offset, count, width, dtype, stride, index)
-        if description.sparse is not None:
-            values = values.copy()
-            where, what = description.sparse.indices, description.sparse.values
-            kind = np.dtype(COMPONENTS[where.componentType])
-            number = description.sparse.count
-            rows = self._read(where.bufferView, where.byteOffset or 0, number, 1, kind, None, index)[:, 0]
-            values[rows] = self._read(what.bufferView, what.byteOffset or 0, number, width, dtype, None, index)
-        if description.normalized and dtype.kind in "iu":
+            offset = document.whole(description, "byteOffset", name, 0)
+            values = self._read(description["bufferView"], offset, count, width, dtype, name)
+        sparse = document.part(description, "sparse", name)
+        if sparse is not None:
+            values = self._sparse(values.copy(), sparse, dtype, name)
+        if description.get("normalized") and dtype.kind in "iu":
             values = np.maximum(values.astype(np.float32) / np.iinfo(dtype.name).max, -1.0)
         return values[:, 0] if width == 1 else values
 
-    def _read(
-        self, view: int, offset: int, count: int, width: int, dtype: np.dtype, stride: int | None, accessor: int
-    ) -> np.ndarray:
-        data = self.view(view)
-        stride = stride or width * dtype.itemsize
-        needed = offset + stride * (count - 1) + width * dtype.itemsize if count else 0
+    def _component(self, description: Part, name: str) -> np.dtype:
+        component = description.get("componentType")
+        if component not in COMPONENTS:
+            raise self.document.error(
+                name, f"componentType must be one of {', '.join(map(str, COMPONENTS))}, got {component!r}"
+            )
+        return np.dtype(COMPONENTS[component]).newbyteorder("<")
+
+    def _sparse(self, values: np.ndarray, sparse: Part, dtype: np.dtype, name: str) -> np.ndarray:
+        """Write the values of a sparse accessor over ``values`` [count, width], and return these."""
+        document = self.document
+        where, what = (document.part(sparse, key, name) for key in ("indices", "values"))
+        if where is None or what is None:
+            raise document.error(name, "its sparse part lacks indices or values")
+        number = document.whole(sparse, "count", name)
+        kind = self._component(where, name)
+        offsets = [document.whole(one, "byteOffset", name, 0) for one in (where, what)]
+        rows = self._read(where.get("bufferView"), offsets[0], number, 1, kind, name)[:, 0]
+        if len(rows) and int(rows.max()) >= len(values):
+            raise document.error(name, f"its sparse part names element {rows.max()}, and it has {len(values)}")
+        values[rows] = self._read(what.get("bufferView"), offsets[1], number, values.shape[1], dtype, name)
+        return values
+
+    def _read(self, view: object, offset: int, count: int, width: int, dtype: np.dtype, name: str) -> np.ndarray:
+        data = self.view(view, name)
+        size = width * dtype.itemsize
+        stride = self.document.whole(self.document.items("bufferViews")[int(view)], "byteStride", name, 0) or size  # type: ignore[call-overload]
+        needed = offset + stride * (count - 1) + size if count else 0
         if needed > len(data):
             raise SceneError(
-                f"{str(self.path)!r}: accessor {accessor} needs {needed} bytes, its buffer view has {len(data)};"
-                " the file is damaged"
+                f"{str(self.path)!r}: {name} needs {needed} bytes, its buffer view has {len(data)}; the file is damaged"
             )
         return np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize))

@@ -3,126 +3,288 @@
 from __future__ import annotations
 
 import urllib.parse
-import warnings
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import pygltflib
 
+from warp_gi.color import SRGB_TO_LINEAR, encode_srgb
 from warp_gi.errors import SceneError
 from warp_gi.scene.files.gltf_buffers import Buffers, decode_data_uri
+from warp_gi.scene.files.gltf_document import Document, Part
 from warp_gi.scene.files.images import find_file, read_image
-from warp_gi.scene.model import Material, Texture
+from warp_gi.scene.model import Color, Material, Texture
 
 WRAP_MODES = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 BLEND_CUTOFF = 0.5
+NEAREST = 9728  # the one filter without interpolation between texels
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinates:
+    """Texture coordinates that the meshes of a material need."""
+
+    number: int = 0
+    """Set of the mesh's own coordinates."""
+    transform: np.ndarray = field(default_factory=lambda: np.eye(3))
+    """Their transform, v down, float64 [3, 3]."""
+    further: int | None = None
+    """Second set, or None."""
 
 
 class MaterialReader:
-    """Makes each material and each texture of a document once."""
+    """Makes each material and each texture of a document once.
 
-    def __init__(self, document: pygltflib.GLTF2, buffers: Buffers) -> None:
+    Textures of a material share the coordinates of its meshes: those of the base colour, or of the first texture that
+    there is. A texture whose coordinates are others says so itself, see ``Texture.transform``.
+    """
+
+    def __init__(self, document: Document, buffers: Buffers) -> None:
         self.document, self.buffers = document, buffers
-        self._materials: dict[int | None, Material] = {}
+        self._materials: dict[int | None, tuple[Material, Coordinates]] = {}
         self._images: dict[int, np.ndarray] = {}
-        self._textures: dict[tuple[int, bool], Texture] = {}
+        self._textures: dict[tuple[object, ...], Texture] = {}
 
-    def material(self, index: int | None) -> Material:
-        """Return material ``index``; None is glTF's default material."""
+    def material(self, index: int | None, owner: str) -> tuple[Material, Coordinates]:
+        """Return material ``index``, and the coordinates that meshes with it need; None is glTF's default material."""
         if index not in self._materials:
-            self._materials[index] = Material("default", (1.0, 1.0, 1.0), metallic=1.0, double_sided=False)
+            default = Material("default", (1.0, 1.0, 1.0), metallic=1.0, double_sided=False)
+            self._materials[index] = default, Coordinates()
             if index is not None:
-                self._materials[index] = self._read(index)
+                self._materials[index] = self._read(index, owner)
         return self._materials[index]
 
-    def _read(self, index: int) -> Material:
-        source = self.document.materials[index]
-        name = source.name or f"material {index}"
-        extensions = source.extensions or {}
-        surface = source.pbrMetallicRoughness
-        red, green, blue, alpha = (surface and surface.baseColorFactor) or (1.0,) * 4
-        strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
-        cutoffs = {"OPAQUE": None, "MASK": 0.5 if source.alphaCutoff is None else source.alphaCutoff}
-        specular = extensions.get("KHR_materials_specular", {})
-        emission = [strength * x for x in source.emissiveFactor or (0.0, 0.0, 0.0)]
-        normal = source.normalTexture
-        return Material(
-            name,
+    def _read(self, index: int, owner: str) -> tuple[Material, Coordinates]:
+        document = self.document
+        source = document.item("materials", index, owner)
+        what = document.name("materials", index)
+        old = document.extension(source, "KHR_materials_pbrSpecularGlossiness", what)
+        surface = document.part(source, "pbrMetallicRoughness", what) or {}
+        coat = document.extension(source, "KHR_materials_specular", what) or {}
+        ior = document.extension(source, "KHR_materials_ior", what) or {}
+        normal = document.part(source, "normalTexture", what) or {}
+        coordinates = self._coordinates(old or {}, surface, source, coat, what)
+        slot = _Slots(self, coordinates, what)
+        strength = document.extension(source, "KHR_materials_emissive_strength", what) or {}
+        red, green, blue, alpha = document.numbers(surface, "baseColorFactor", what, (1.0,) * 4)
+        emission = scaled(
+            document.numbers(source, "emissiveFactor", what, (0.0,) * 3),
+            document.number(strength, "emissiveStrength", what, 1.0),
+        )
+        reflectance = scaled(
+            document.numbers(coat, "specularColorFactor", what, (1.0,) * 3),
+            _normal_reflectance(document.number(ior, "ior", what, 1.5)),
+        )
+        result = Material(
+            document.text(source, "name") or what,
             base_color=(red, green, blue),
             alpha=alpha,
-            metallic=1.0 if surface is None or surface.metallicFactor is None else surface.metallicFactor,
-            roughness=1.0 if surface is None or surface.roughnessFactor is None else surface.roughnessFactor,
-            specular=specular.get("specularFactor", 1.0),
-            emission=tuple(emission),
-            base_color_texture=self._texture(surface and surface.baseColorTexture, True, name),
-            metallic_roughness_texture=self._texture(surface and surface.metallicRoughnessTexture, False, name),
-            normal_texture=self._texture(normal, False, name),
-            emission_texture=self._texture(source.emissiveTexture if any(emission) else None, True, name),
-            normal_scale=1.0 if normal is None or normal.scale is None else normal.scale,
-            alpha_cutoff=cutoffs.get(source.alphaMode or "OPAQUE", BLEND_CUTOFF),
-            double_sided=bool(source.doubleSided),
+            metallic=document.number(surface, "metallicFactor", what, 1.0),
+            roughness=document.number(surface, "roughnessFactor", what, 1.0),
+            specular=document.number(coat, "specularFactor", what, 1.0),
+            reflectance=reflectance,
+            emission=emission,
+            base_color_texture=slot.texture(surface, "baseColorTexture", True),
+            metallic_roughness_texture=slot.texture(surface, "metallicRoughnessTexture", False),
+            normal_texture=slot.texture(source, "normalTexture", False),
+            emission_texture=slot.texture(source, "emissiveTexture", True) if any(emission) else None,
+            specular_texture=slot.texture(coat, "specularTexture", False),
+            reflectance_texture=slot.texture(coat, "specularColorTexture", True),
+            normal_scale=document.number(normal, "scale", what, 1.0),
+            alpha_cutoff=self._cutoff(source, what),
+            double_sided=bool(source.get("doubleSided")),
+        )
+        if old is not None:
+            result = self._converted(result, old, slot, what)
+        if document.extension(source, "KHR_materials_unlit", what) is not None:
+            result = replace(
+                result,
+                base_color=(0.0, 0.0, 0.0),
+                metallic=0.0,
+                specular=0.0,
+                emission=result.base_color,
+                emission_texture=result.base_color_texture,
+                metallic_roughness_texture=None,
+                normal_texture=None,
+                colors_emit=True,
+            )
+        return result, coordinates
+
+    def _coordinates(self, old: Part, surface: Part, source: Part, coat: Part, what: str) -> Coordinates:
+        """Return the coordinates of the first texture of a material; note a third set."""
+        places = [(old, "diffuseTexture"), (surface, "baseColorTexture"), (source, "emissiveTexture")]
+        places += [(source, "normalTexture"), (surface, "metallicRoughnessTexture"), (old, "specularGlossinessTexture")]
+        places += [(coat, "specularTexture"), (coat, "specularColorTexture")]
+        infos = [self.document.part(holder, key, what) for holder, key in places]
+        found = [texture_transform(self.document, info, what) for info in infos if info is not None]
+        if not found:
+            return Coordinates()
+        others = dict.fromkeys(number for number, _ in found if number != found[0][0])
+        if len(others) > 1:
+            self.document.findings.add("a third set of texture coordinates", what)
+        return Coordinates(*found[0], next(iter(others), None))
+
+    def _converted(self, material: Material, old: Part, slot: _Slots, what: str) -> Material:
+        """Return a material with what KHR_materials_pbrSpecularGlossiness says of it.
+
+        Diffuse times 1 - max(specular) becomes the base colour, specular the reflectance at normal incidence, and
+        1 - glossiness the roughness; a texture of the two is taken apart. Without specular it is pure Lambert.
+        """
+        document = self.document
+        red, green, blue, alpha = document.numbers(old, "diffuseFactor", what, (1.0,) * 4)
+        specular = document.numbers(old, "specularFactor", what, (1.0,) * 3)
+        gloss = document.number(old, "glossinessFactor", what, 1.0)
+        color = slot.texture(old, "diffuseTexture", True)
+        both = slot.texture(old, "specularGlossinessTexture", True)
+        share = 1.0 - max(specular) if both is None else 1.0
+        roughness, texture = 1.0 - gloss, None
+        if both is not None:
+            roughness = 1.0
+            rough = np.round(255.0 - gloss * both.pixels[..., 3]).astype(np.uint8)
+            texture = replace(both, srgb=False, pixels=np.stack([rough, rough, np.zeros_like(rough), rough], axis=2))
+            darkened = darker(color, both, max(specular))
+            color = replace(color, pixels=darkened) if color is not None else replace(both, pixels=darkened)
+            color = replace(color, uv_set=0, transform=None)
+        return replace(
+            material,
+            base_color=(red * share, green * share, blue * share),
+            alpha=alpha,
+            metallic=0.0,
+            roughness=roughness,
+            specular=min(max(specular) / 0.04, 1.0),
+            reflectance=scaled(specular, 1.0 / max(min(max(specular) / 0.04, 1.0), 1e-6)),
+            base_color_texture=color,
+            metallic_roughness_texture=texture,
+            specular_texture=None,
+            reflectance_texture=both,
         )
 
-    def _texture(self, info: pygltflib.TextureInfo | None, srgb: bool, material: str) -> Texture | None:
-        if info is None or info.index is None:
-            return None
-        key = (info.index, srgb)
+    def _cutoff(self, source: Part, what: str) -> float | None:
+        mode = source.get("alphaMode", "OPAQUE")
+        if mode not in ("OPAQUE", "MASK", "BLEND"):
+            raise self.document.error(what, f"alphaMode must be OPAQUE, MASK or BLEND, got {mode!r:.60}")
+        if mode == "BLEND":
+            self.document.findings.add("alphaMode BLEND", what)
+            return BLEND_CUTOFF
+        return self.document.number(source, "alphaCutoff", what, 0.5) if mode == "MASK" else None
+
+    def texture(self, info: Part, srgb: bool, coordinates: Coordinates, what: str, material: str) -> Texture:
+        """Return the texture that a material names."""
+        index = self.document.whole(info, "index", what)
+        number, transform = texture_transform(self.document, info, what)
+        relative: tuple[Color, Color] | None = None
+        further = number != coordinates.number
+        if further:
+            relative = upward_rows(transform)
+        elif not np.allclose(transform, coordinates.transform):
+            relative = upward_rows(transform @ np.linalg.pinv(coordinates.transform))
+        key = index, srgb, further, relative
         if key not in self._textures:
-            texture = self.document.textures[info.index]
-            if texture.source is None:
-                raise SceneError(
-                    f"{str(self.buffers.path)!r}: texture {info.index} of material {material!r} has no image"
-                )
-            wrap: tuple[str, str] = ("repeat", "repeat")
-            if texture.sampler is not None:
-                sampler = self.document.samplers[texture.sampler]
-                u, v = (WRAP_MODES.get(mode or 10497, str(mode)) for mode in (sampler.wrapS, sampler.wrapT))
-                wrap = u, v
-            image = self.document.images[texture.source]
-            name = texture.name or image.name or (image.uri or "")[:80] or f"image {texture.source}"
-            if name.startswith("data:"):
-                name = f"image {texture.source}"
-            self._textures[key] = Texture(name, self._pixels(texture.source, name, material), srgb, wrap)
+            self._textures[key] = replace(
+                self._read_texture(index, srgb, what, material), uv_set=int(further), transform=relative
+            )
         return self._textures[key]
+
+    def _read_texture(self, index: int, srgb: bool, what: str, material: str) -> Texture:
+        document = self.document
+        texture = document.item("textures", index, what)
+        source = self._image_of(texture, index, material)
+        wrap: tuple[str, str] = ("repeat", "repeat")
+        nearest = False
+        if texture.get("sampler") is not None:
+            sampler = document.item("samplers", texture["sampler"], f"texture {index}")
+            u, v = (document.whole(sampler, key, f"texture {index}", 10497) for key in ("wrapS", "wrapT"))
+            wrap = WRAP_MODES.get(u, str(u)), WRAP_MODES.get(v, str(v))
+            nearest = sampler.get("magFilter") == NEAREST
+        image = document.item("images", source, f"texture {index}")
+        name = document.text(texture, "name") or document.text(image, "name") or document.text(image, "uri")[:80]
+        if not name or name.startswith("data:"):
+            name = f"image {source}"
+        return Texture(name, self._pixels(source, name, material), srgb, wrap, nearest)
+
+    def _image_of(self, texture: Part, index: int, material: str) -> int:
+        """Return the image of a texture; a WebP one comes before its stand-in in another format."""
+        what = f"texture {index} of {material}"
+        webp = self.document.extension(texture, "EXT_texture_webp", what)
+        if webp is not None and webp.get("source") is not None:
+            return self.document.whole(webp, "source", what)
+        if texture.get("source") is None:
+            if self.document.extension(texture, "KHR_texture_basisu", what) is not None:
+                raise self.document.error(what, "is a KTX2 image, which is not supported; export it as PNG or JPEG")
+            raise SceneError(f"{str(self.document.path)!r}: {what} has no image")
+        return self.document.whole(texture, "source", what)
 
     def _pixels(self, index: int, name: str, material: str) -> np.ndarray:
         if index not in self._images:
-            image = self.document.images[index]
-            what = f"{str(self.buffers.path)!r}: texture {name!r} of material {material!r}"
-            if image.bufferView is not None:
-                source: Path | bytes | memoryview = self.buffers.view(image.bufferView)
-            elif image.uri is None:
+            image = self.document.item("images", index, f"texture {name!r}")
+            what = f"{str(self.document.path)!r}: texture {name!r} of {material}"
+            uri = self.document.text(image, "uri")
+            if image.get("bufferView") is not None:
+                source: Path | bytes | memoryview = self.buffers.view(image["bufferView"], f"image {index}")
+            elif not uri:
                 raise SceneError(f"{what} has neither a file nor data")
-            elif image.uri.startswith("data:"):
-                source = decode_data_uri(image.uri)
+            elif uri.startswith("data:"):
+                source = decode_data_uri(uri)
             else:
-                source = find_file(self.buffers.path.parent, urllib.parse.unquote(image.uri), what)
+                source = find_file(self.document.path.parent, urllib.parse.unquote(uri), what)
             self._images[index] = read_image(source, what)
         return self._images[index]
 
 
-def texture_transform(source: pygltflib.Material) -> tuple[int, np.ndarray]:
-    """Return a material's texture coordinate set and its KHR_texture_transform (float64 [3, 3] on v-down uv).
+class _Slots:
+    """Reads the textures of one material."""
 
-    Textures of one material share one set here: that of the first of base colour,
-    emission, normal, metallic-roughness; a warning says so when they differ.
-    """
-    surface = source.pbrMetallicRoughness
-    infos = [surface and surface.baseColorTexture, source.emissiveTexture, source.normalTexture]
-    infos = [info for info in (*infos, surface and surface.metallicRoughnessTexture) if info is not None]
-    found = []
-    for info in infos:
-        extension = (info.extensions or {}).get("KHR_texture_transform", {})
-        (du, dv), angle = extension.get("offset", (0.0, 0.0)), extension.get("rotation", 0.0)
-        su, sv = extension.get("scale", (1.0, 1.0))
-        c, s = np.cos(angle), np.sin(angle)
-        matrix = np.array([[c * su, s * sv, du], [-s * su, c * sv, dv], [0.0, 0.0, 1.0]])
-        found.append((extension.get("texCoord", info.texCoord or 0), matrix))
-    if not found:
-        return 0, np.eye(3)
-    if any(coordinates != found[0][0] or not np.allclose(m, found[0][1]) for coordinates, m in found[1:]):
-        warnings.warn(
-            f"material {source.name!r}: its textures have different coordinates; those of the first are used for all",
-            stacklevel=2,
-        )
-    return found[0]
+    def __init__(self, reader: MaterialReader, coordinates: Coordinates, material: str) -> None:
+        self.reader, self.coordinates, self.material = reader, coordinates, material
+
+    def texture(self, source: Part, key: str, srgb: bool) -> Texture | None:
+        """Return the texture in a field of a part of the material, or None."""
+        info = self.reader.document.part(source, key, self.material)
+        if info is None:
+            return None
+        return self.reader.texture(info, srgb, self.coordinates, f"{key} of {self.material}", self.material)
+
+
+def scaled(values: tuple[float, ...], factor: float) -> Color:
+    """Return three numbers times a factor."""
+    red, green, blue = (factor * value for value in values)
+    return red, green, blue
+
+
+def _normal_reflectance(ior: float) -> float:
+    """Return the reflectance of an index of refraction at normal incidence; 0 stands for one that is infinite."""
+    return 0.04 if ior == 1.5 else ((ior - 1.0) / (ior + 1.0)) ** 2
+
+
+def darker(color: Texture | None, both: Texture, most: float) -> np.ndarray:
+    """Return sRGB pixels of a diffuse texture times 1 - max(specular), at the size of the larger of the two."""
+    from PIL import Image
+
+    base = np.full_like(both.pixels, 255) if color is None else color.pixels
+    size = max(base.shape[1], both.pixels.shape[1]), max(base.shape[0], both.pixels.shape[0])
+
+    def resized(pixels: np.ndarray) -> np.ndarray:  # RGBA images would be weighted by their alpha
+        return np.asarray(Image.fromarray(np.ascontiguousarray(pixels)).resize(size))
+
+    share = 1.0 - most * SRGB_TO_LINEAR[resized(both.pixels[..., :3])].max(axis=2, keepdims=True)
+    dark = encode_srgb(SRGB_TO_LINEAR[resized(base[..., :3])] * share)
+    return np.dstack([np.round(dark * 255.0).astype(np.uint8), resized(base[..., 3])])
+
+
+def upward_rows(matrix: np.ndarray) -> tuple[Color, Color]:
+    """Return a transform [3, 3] of coordinates with v down as rows of one with v up."""
+    flip = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 1.0], [0.0, 0.0, 1.0]])
+    rows = (flip @ matrix @ flip)[:2].tolist()
+    return (rows[0][0], rows[0][1], rows[0][2]), (rows[1][0], rows[1][1], rows[1][2])
+
+
+def texture_transform(document: Document, info: Part, what: str) -> tuple[int, np.ndarray]:
+    """Return the coordinates of a texture: number of the set and KHR_texture_transform [3, 3], v down, float64."""
+    extension = document.extension(info, "KHR_texture_transform", what) or {}
+    du, dv = document.numbers(extension, "offset", what, (0.0, 0.0))
+    su, sv = document.numbers(extension, "scale", what, (1.0, 1.0))
+    angle = document.number(extension, "rotation", what, 0.0)
+    c, s = np.cos(angle), np.sin(angle)
+    matrix = np.array([[c * su, s * sv, du], [-s * su, c * sv, dv], [0.0, 0.0, 1.0]])
+    own = document.whole(info, "texCoord", what, 0)
+    return document.whole(extension, "texCoord", what, own), matrix

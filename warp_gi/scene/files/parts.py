@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from warp_gi.scene.animation import moved_keyframes, turned_quaternion, world_matrices
+from warp_gi.scene.files.support import Findings
 from warp_gi.scene.model import Mesh, Node, PunctualLight
 from warp_gi.scene.normals import smooth_mesh
 from warp_gi.scene.pinhole import Camera
@@ -21,6 +22,8 @@ class SceneParts:
     lights: list[PunctualLight] = field(default_factory=list)
     cameras: dict[str, Camera] = field(default_factory=dict)
     camera_nodes: dict[str, int] = field(default_factory=dict)
+    findings: Findings = field(default_factory=Findings)
+    """What the file uses and was not read in full."""
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
     """What was taken from all positions, float64 [3]."""
 
@@ -71,6 +74,7 @@ class SceneParts:
             [moved_light(light) for light in self.lights],
             {name: camera.relative_to(offset) for name, camera in self.cameras.items()},
             self.camera_nodes,
+            self.findings,
             self.offset + offset,
         )
 
@@ -110,6 +114,7 @@ class SceneParts:
             [scaled_light(light) for light in self.lights],
             {name: scaled_camera(camera) for name, camera in self.cameras.items()},
             self.camera_nodes,
+            self.findings,
             scale * self.offset,
         )
 
@@ -145,6 +150,7 @@ class SceneParts:
             [turned_light(light) for light in self.lights],
             {name: turned_camera(camera) for name, camera in self.cameras.items()},
             self.camera_nodes,
+            self.findings,
             rotation @ self.offset,
         )
 

@@ -27,6 +27,8 @@ from warp_gi.techniques.shared.lamps import lit_data
 from warp_gi.techniques.shared.views import camera_rows, cameras_of
 
 if TYPE_CHECKING:
+    import warp as wp
+
     from warp_gi.frame import Frame
     from warp_gi.scene.scene import Scene
 
@@ -226,6 +228,14 @@ class LightFieldProbes(Estimator, RadianceCache):
         """Camera rays through the probes, if ``primary`` is "probes"; else None."""
         return ProbeRays() if self.primary == "probes" else None
 
+    def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
+        """Return the kernels of light at surfaces."""
+        return (trace_kernels.trace_probes,)
+
+    def samplers(self, scene: Scene | BakedScene | None = None) -> tuple[Any, ...]:
+        """Return the probes, as paths end in them."""
+        return (light_field_cache.PROBE_CACHE,)
+
     def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
         """Return whether frames may show probes that follow a sky or objects, and so what earlier frames refreshed."""
         return ahead is None or ahead.sky_changes or (self.update > 0 and scene.is_animated)
@@ -274,7 +284,7 @@ class LightFieldProbes(Estimator, RadianceCache):
         buffers.indirect = frame["indirect"]
         buffers.moment1, buffers.moment2 = frame.moments("indirect")
         if (lobes := frame.lobes()) is not None:
-            buffers.diffuse, buffers.glossy = lobes
+            buffers.diffuse, buffers.glossy = lobes.diffuse, lobes.glossy
         data = lit_data(frame.scene, state.device)
         inputs = [data, frame.camera_data, settings, state.field, query, frame.hits, buffers]
         frame.launch_tiled(trace_kernels.trace_probes, inputs)

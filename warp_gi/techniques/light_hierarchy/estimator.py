@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -38,6 +38,11 @@ class LightHierarchy(Estimator):
     """
 
     term: ClassVar[str] = "emitters"
+
+    def samplers(self, scene: Scene | BakedScene | None = None) -> tuple[Any, ...]:
+        """Return the hierarchy; the table by power for a scene of one lamp."""
+        by_tree = scene is None or has_choice(scene)
+        return (light_hierarchy.HIERARCHY_LIGHTS if by_tree else path_samplers.ALIAS_LIGHTS,)
 
     def bake_key(self, scene: Scene | BakedScene) -> str:
         """Return a hash of all but the sky."""

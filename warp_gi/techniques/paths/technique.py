@@ -12,7 +12,7 @@ TECHNIQUE = Technique(
         "BsdfPaths": Entry("estimators"),
     },
     presets={"path": {}, "direct": {"indirect": None}},
-    samplers=("path_samplers.ALIAS_LIGHTS", "path_samplers.BSDF_DIRECTIONS"),
+    samplers=("path_samplers.ALIAS_LIGHTS", "path_samplers.BSDF_DIRECTIONS", "apart_lights.APART_LIGHTS"),
     suite="path",
     page="techniques/path_tracing.md",
 )

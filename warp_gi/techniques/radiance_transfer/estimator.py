@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from numbers import Real
 from operator import or_
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.estimator import Estimator
@@ -25,6 +25,8 @@ from warp_gi.techniques.shared.atlas.densities import parse_texel_sets
 from warp_gi.techniques.shared.lamps import lamps_move
 
 if TYPE_CHECKING:
+    import warp as wp
+
     from warp_gi.baking import Bake, Setting
     from warp_gi.frame import Frame
     from warp_gi.scene.baked import BakedScene
@@ -156,9 +158,21 @@ class RadianceTransfer(Estimator, RadianceCache):
         """Return a hash of all that the bake depends on: not of the sky."""
         return transfer_key(whole_scene(scene), self.bounces > 0)
 
+    def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
+        """Return the kernels of light at surfaces."""
+        return (transfer_shade.shade_transfer,)
+
+    def samplers(self, scene: Scene | BakedScene | None = None) -> tuple[Any, ...]:
+        """Return the transfer, as paths end in it."""
+        return (transfer_light.TRANSFER_CACHE,)
+
     def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Setting]:
         """Return the settings that the bake depends on."""
         return self.transfer_settings.stored()
+
+    def bake_identity(self, scene: Scene | BakedScene, camera: Camera | CameraPath | None = None) -> str:
+        """Return the hash of what is baked: never the sky, and no view."""
+        return self.bake_key(scene)
 
     def bake(
         self,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import warp as wp
 
 from warp_gi import launch
 from warp_gi.errors import OptionError, check_whole
 from warp_gi.kernels import guided_directions, guided_shares, quadtree, quadtree_adapt
+from warp_gi.kernels.reuse_gains import sum_gains
 from warp_gi.techniques.paths.estimators import BsdfPaths
 from warp_gi.techniques.reuse.rest import GUIDE_COST, Rest, rest_after, wish_for_lesson, woken_by
 from warp_gi.techniques.reuse.sample_octree import Lesson, SampleOctree
@@ -76,6 +77,15 @@ class GuidedPaths(BsdfPaths):
     def services(self) -> tuple[Service, ...]:
         """The octree of regions, which also sorts a frame's samples by region."""
         return (SampleOctree(),)
+
+    def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
+        """Return the kernels of learning."""
+        gains = (sum_gains,) if self.rests else ()
+        return (guided_shares.adapt_shares, quadtree_adapt.adapt_quadtrees, *gains)
+
+    def samplers(self, scene: Scene | BakedScene | None = None) -> tuple[Any, ...]:
+        """Return the guided directions."""
+        return (guided_directions.GUIDED_DIRECTIONS,)
 
     @property
     def saves_state(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import warp as wp
@@ -13,6 +13,7 @@ from warp_gi.alias import AliasTable
 from warp_gi.errors import OptionError, check_whole, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.kernels import light_cache, light_cache_build, light_cache_native
+from warp_gi.kernels.reuse_gains import sum_gains
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.emitters import PlacedEmitters
 from warp_gi.techniques.light_hierarchy.estimator import (
@@ -103,6 +104,15 @@ class VisibilityLightCache(Estimator):
     def services(self) -> tuple[Service, ...]:
         """The octree of regions, which also sorts a frame's samples by region."""
         return (SampleOctree(),)
+
+    def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
+        """Return the kernels of lights' shapes, and of learning."""
+        gains = (sum_gains,) if self.rests else ()
+        return (light_cache.shape_lights, light_cache_build.rank_lights, *gains)
+
+    def samplers(self, scene: Scene | BakedScene | None = None) -> tuple[Any, ...]:
+        """Return the cached lights; nothing for a scene without emitters."""
+        return (light_cache.CACHED_LIGHTS,) if scene is None or scene.emitter_count else ()
 
     @property
     def saves_state(self) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -58,6 +58,14 @@ class SampleOctree(Service):
             check_whole(f"octree.{name}", getattr(self, name), least, MOST_SAMPLES)
         if self.collapse > self.split:
             raise OptionError(f"octree.collapse must be at most octree.split ({self.split}), got {self.collapse}")
+
+    def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
+        """Return the kernels of the tree, and of lists of samples."""
+        return (octree_kernels.augment_leaves, sample_kernels.count_samples)
+
+    def samplers(self, scene: Scene | BakedScene | None = None) -> tuple[Any, ...]:
+        """Return the regions."""
+        return (sample_kernels.SAMPLE_REGIONS,)
 
     @property
     def saves_state(self) -> bool:

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from warp_gi import launch
 from warp_gi.baking import Bake
 from warp_gi.errors import BakeError, OptionError, SceneError, check_whole
 from warp_gi.kernels.surface_cache import SURFACE_CACHE, SurfaceCells
+from warp_gi.kernels.surface_cache_fill import fill_cells
 from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import whole_scene
 from warp_gi.stateful import Ahead
@@ -23,6 +24,8 @@ from warp_gi.techniques.surface_cache.fill import FillSettings, camera_boxes, em
 from warp_gi.techniques.surface_cache.state import CacheState, Refresh, followed, is_moving
 
 if TYPE_CHECKING:
+    import warp as wp
+
     from warp_gi.baking import Setting
     from warp_gi.frame import Frame
     from warp_gi.scene.baked import BakedScene
@@ -93,6 +96,14 @@ class SurfaceCache(RadianceCache):
     def fill_settings(self) -> FillSettings:
         """The settings that decide the cells."""
         return FillSettings(**{one.name: getattr(self, one.name) for one in fields(FillSettings)})
+
+    def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
+        """Return the kernels of the fill."""
+        return (fill_cells,)
+
+    def samplers(self, scene: Scene | BakedScene | None = None) -> tuple[Any, ...]:
+        """Return the cells, as paths read them."""
+        return (SURFACE_CACHE,)
 
     # ---- bake ----
 

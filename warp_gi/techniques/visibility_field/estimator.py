@@ -16,10 +16,13 @@ from warp_gi.errors import OptionError, unknown_name
 from warp_gi.estimator import Ahead, Estimator
 from warp_gi.kernels import harmonics as harmonics_kernels
 from warp_gi.kernels import visibility_field as field_kernels
+from warp_gi.kernels import visibility_field_bake as bake_kernels
 from warp_gi.kernels import visibility_field_trace as trace_kernels
 from warp_gi.scene.baked import BakedScene, whole_scene
-from warp_gi.scene.camera import Camera, CameraPath
+from warp_gi.scene.camera import Camera, CameraPath, views_hash
+from warp_gi.stateful import Forecast
 from warp_gi.techniques.visibility_field.bake import field_query, grid_of
+from warp_gi.techniques.visibility_field.cost import TOLD_SECONDS, bake_seconds, traced_seconds
 from warp_gi.techniques.visibility_field.settings import MaskSettings
 from warp_gi.techniques.visibility_field.state import (
     RAYS_A_MILLISECOND,
@@ -140,6 +143,27 @@ class VisibilityField(Estimator):
         settings = self.mask_settings
         return stored_settings(settings, grid_of(scene.bounds, settings.cell_size))
 
+    def bake_identity(self, scene: Scene | BakedScene, camera: Camera | CameraPath | None = None) -> str:
+        """Return the hash of the geometry, and of the views if only cells that they see are baked."""
+        return f"{self.bake_key(scene)} {views_hash(camera) if self.lazy else 'everywhere'}"
+
+    def forecast(
+        self, scene: Scene, device: wp.Device, seed: int, camera: Camera | CameraPath, samples: int
+    ) -> Forecast | None:
+        """Return the cost of all cells from that of some, and the time of the rays that a frame traces without them.
+
+        A sky that is a map takes two rays a sample, a constant one the BSDF's alone. A field saves less: rays that its
+        cells do not decide are traced, and looking others up takes time, too.
+        """
+        if not self.uses_cells:
+            return None
+        seconds = bake_seconds(scene, device, self.mask_settings, seed, camera if self.lazy else None)
+        if seconds < TOLD_SECONDS:
+            return None
+        sky, view = scene.environment, camera.camera(0) if isinstance(camera, CameraPath) else camera
+        rays = 0 if sky is None or sky.is_black else 1 if sky.pixels is None else 2
+        return Forecast(seconds, traced_seconds(scene, device, view, float(rays * samples), seed))
+
     def bake(
         self,
         scene: Scene,
@@ -164,6 +188,13 @@ class VisibilityField(Estimator):
         return FieldState.from_bake(scene, target, self.mask_settings, seed, bake)
 
     # ---- frames ----
+
+    def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
+        """Return the kernels of cells and of their light."""
+        return (
+            bake_kernels.find_cells,
+            trace_kernels.trace_field,
+        )
 
     @property
     def saves_state(self) -> bool:

@@ -186,6 +186,8 @@ def _notes(scene: Scene, shown: Surfaces, rows: Rows) -> list[str]:
         )
     if scene.emitter_count:
         notes.append("Direct light of lamps is not shown.")
+    if scene._flat.colors is not None:
+        notes.append("Colours of vertices are in the light of bounces, and not on the surfaces themselves.")
     return notes
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_gi.files import replacing
+from warp_gi.files import cache_folder, prune, replacing
 from warp_gi.techniques.shared.atlas.chart_job import WORKER
 
 FORMAT = "warp_gi charts 1"
@@ -27,19 +27,13 @@ ROUNDING = 0.01
 Arrays = dict[str, np.ndarray]
 
 
-def cache_folder() -> Path:
-    """Return where charts are kept: ``warp_gi/charts`` in XDG_CACHE_HOME, or in ~/.cache."""
-    root = os.environ.get("XDG_CACHE_HOME")
-    return (Path(root) if root else Path.home() / ".cache") / "warp_gi" / "charts"
-
-
 def cached(kind: str, job: Arrays, make: Callable[[], Arrays]) -> Arrays:
     """Return the arrays that were kept for a job of this kind; or make them, and keep them.
 
     A file that is damaged, or whose arrays cannot be those of the job, is made again, with a warning. A folder that
     cannot be written to is only a warning.
     """
-    path = cache_folder() / f"{kind}-{_key(kind, job)}.npz"
+    path = cache_folder("charts") / f"{kind}-{_key(kind, job)}.npz"
     found = _read(path, kind, job)
     if found is not None:
         return found
@@ -47,7 +41,7 @@ def cached(kind: str, job: Arrays, make: Callable[[], Arrays]) -> Arrays:
     try:
         with replacing(path) as part, open(part, "wb") as file:
             np.savez(file, **made)  # type: ignore[arg-type]
-        _prune(path.parent)
+        prune(path.parent, "*.npz", MOST_BYTES)
     except OSError as error:
         warnings.warn(f"charts cannot be kept for the next time: {error}", stacklevel=2)
     return made
@@ -102,20 +96,3 @@ def _check(kind: str, job: Arrays, arrays: Arrays) -> None:
     within = (placed >= -ROUNDING).all() and (placed <= page + ROUNDING).all()
     if not (within and (page >= 0).all() and (page <= job["size"]).all()):
         raise ValueError("corners leave the page")
-
-
-def _prune(folder: Path) -> None:
-    """Remove the files that were not read for longest, until the rest are below MOST_BYTES.
-
-    Another process may remove the same files at the same time.
-    """
-    files = []
-    for path in folder.glob("*.npz"):
-        with contextlib.suppress(FileNotFoundError):
-            stat = path.stat()
-            files.append((stat.st_mtime, stat.st_size, path))
-    total = 0
-    for _, size, path in sorted(files, reverse=True):
-        total += size
-        if total > MOST_BYTES:
-            path.unlink(missing_ok=True)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pygltflib
@@ -19,13 +20,21 @@ from warp_gi.techniques.shared.atlas.atlas import Atlas
 
 FLOAT, UINT = 5126, 5125
 """Component types of glTF."""
-ATTRIBUTES = {"POSITION": "points", "NORMAL": "normals", "TEXCOORD_0": "uvs", "TEXCOORD_1": "atlas_uvs"}
+ATTRIBUTES = {
+    "POSITION": "points",
+    "NORMAL": "normals",
+    "TEXCOORD_0": "uvs",
+    "TEXCOORD_1": "atlas_uvs",
+    "TEXCOORD_2": "further_uvs",
+    "COLOR_0": "colors",
+}
 TEXTURES = {
     "base_color_texture": "baseColorTexture",
     "metallic_roughness_texture": "metallicRoughnessTexture",
     "normal_texture": "normalTexture",
     "emission_texture": "emissiveTexture",
 }
+COAT_TEXTURES = {"specular_texture": "specularTexture", "reflectance_texture": "specularColorTexture"}
 _PNG_LEVEL = 3  # of 9: a third of the time for a twentieth more bytes
 
 
@@ -45,6 +54,10 @@ class DrawnTriangles:
     """Texture coordinates of the materials' textures, v down, float32 [vertex, 2]."""
     atlas_uvs: np.ndarray
     """Coordinates in the page, 0 to 1, v down, float32 [vertex, 2]; 0 without a page."""
+    colors: np.ndarray | None
+    """Linear colours and coverage, float32 [vertex, 4]; None if the scene has none."""
+    further_uvs: np.ndarray | None
+    """Second set of coordinates of the materials' textures, v down, float32 [vertex, 2]; None if there is none."""
     indices: np.ndarray
     """Vertices of each triangle, uint32 [triangle, 3], counter-clockwise seen from the front."""
     faces: np.ndarray
@@ -82,7 +95,12 @@ def drawn_triangles(scene: Scene, atlas: Atlas) -> Iterator[DrawnTriangles]:
         is_smooth = normals.any(axis=2, keepdims=True)
         normals = np.where(is_smooth, normals, flat_normals[:, None]).astype(np.float32)
         uvs = flat.uvs[ids] * np.array((1, -1), np.float32) + np.array((0, 1), np.float32)
-        rows = np.concatenate([points, normals, uvs, atlas_uvs(atlas, faces)], axis=2).reshape(-1, 10)
+        parts = [points, normals, uvs, atlas_uvs(atlas, faces)]
+        if flat.colors is not None:
+            parts.append(flat.colors[ids])
+        if flat.further_uvs is not None:
+            parts.append(flat.further_uvs[ids] * np.array((1, -1), np.float32) + np.array((0, 1), np.float32))
+        rows = np.concatenate(parts, axis=2).reshape(3 * len(faces), -1)
         rows = np.ascontiguousarray(rows, np.float32) + np.float32(0)  # -0 is 0
         words = rows.view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()
         _, first, vertices = np.unique(words, return_index=True, return_inverse=True)
@@ -91,9 +109,10 @@ def drawn_triangles(scene: Scene, atlas: Atlas) -> Iterator[DrawnTriangles]:
         rank[order] = np.arange(len(order))
         kept = rows[first[order]]
         indices = rank[vertices.reshape(-1, 3)].astype(np.uint32)
-        yield DrawnTriangles(
-            int(page), int(material), kept[:, :3], kept[:, 3:6], kept[:, 6:8], kept[:, 8:], indices, faces
-        )
+        columns = kept[:, :3], kept[:, 3:6], kept[:, 6:8], kept[:, 8:10]
+        colors = None if flat.colors is None else kept[:, 10:14]
+        further = None if flat.further_uvs is None else kept[:, -2:]
+        yield DrawnTriangles(int(page), int(material), *columns, colors, further, indices, faces)
 
 
 def glb(scene: Scene, atlas: Atlas, generator: str, extras: dict[str, str] | None = None) -> bytes:
@@ -114,13 +133,24 @@ def glb(scene: Scene, atlas: Atlas, generator: str, extras: dict[str, str] | Non
             document.meshes.append(pygltflib.Mesh(name=name))
         attributes = pygltflib.Attributes()
         for attribute, field in ATTRIBUTES.items():
-            if drawn.page >= 0 or attribute != "TEXCOORD_1":
-                setattr(attributes, attribute, writer.vertices(getattr(drawn, field), attribute == "POSITION"))
+            values = getattr(drawn, field)
+            if values is not None and (drawn.page >= 0 or attribute != "TEXCOORD_1"):
+                setattr(attributes, attribute, writer.vertices(values, attribute == "POSITION"))
         indices = writer.accessor(drawn.indices.reshape(-1), UINT, "SCALAR", pygltflib.ELEMENT_ARRAY_BUFFER)
         primitive = pygltflib.Primitive(attributes=attributes, indices=indices, material=drawn.material)
         document.meshes[-1].primitives.append(primitive)
     document.scenes = [pygltflib.Scene(name=scene.name, nodes=list(range(len(document.nodes))), extras=extras or {})]
     return writer.whole()
+
+
+def transform_record(rows: Sequence[Sequence[float]]) -> dict[str, Any]:
+    """Return an affine map of coordinates, v up, as KHR_texture_transform has it, v down; it knows no shear."""
+    (a, b, c), (d, e, f) = rows
+    m = np.array([[a, -b, b + c], [-d, e, 1.0 - e - f]])  # v down
+    angle = float(np.arctan2(-m[1, 0], m[0, 0]))
+    along = np.hypot(m[0, 0], m[1, 0])
+    across = m[0, 1] * np.sin(angle) + m[1, 1] * np.cos(angle)
+    return {"offset": m[:, 2].tolist(), "rotation": angle, "scale": [float(along), float(across)]}
 
 
 def generator_of(file: Path) -> str:
@@ -141,6 +171,7 @@ class _Writer:
         self.document = document
         self.data = bytearray()
         self.textures: dict[int, int] = {}
+        self.is_transformed = False
 
     def view(self, data: bytes, target: int | None = None) -> int:
         self.data += bytes(-len(self.data) % 4)
@@ -169,6 +200,7 @@ class _Writer:
         if id(texture) not in self.textures:
             modes = {name: mode for mode, name in WRAP_MODES.items()}
             wrap_u, wrap_v = (modes[wrap] for wrap in texture.wrap)
+            filtering = 9728 if texture.nearest else 9729
             image, data = Image.fromarray(texture.pixels), io.BytesIO()
             (image if (texture.pixels[..., 3] < 255).any() else image.convert("RGB")).save(
                 data, format="PNG", compress_level=_PNG_LEVEL
@@ -176,11 +208,19 @@ class _Writer:
             view = self.view(data.getvalue())
             document = self.document
             document.images.append(pygltflib.Image(name=texture.name, bufferView=view, mimeType="image/png"))
-            document.samplers.append(pygltflib.Sampler(wrapS=wrap_u, wrapT=wrap_v))
+            document.samplers.append(pygltflib.Sampler(wrapS=wrap_u, wrapT=wrap_v, magFilter=filtering))
             last = len(document.images) - 1
             document.textures.append(pygltflib.Texture(name=texture.name, source=last, sampler=last))
             self.textures[id(texture)] = last
         return self.textures[id(texture)]
+
+    def info(self, texture: Texture) -> dict[str, Any]:
+        """Return how a material names a texture: which, at which coordinates, and how these are transformed."""
+        found: dict[str, Any] = {"index": self.texture(texture), "texCoord": 2 if texture.uv_set else 0}
+        if texture.transform is not None:
+            self.is_transformed = True
+            found["extensions"] = {"KHR_texture_transform": transform_record(texture.transform)}
+        return found
 
     def material(self, source: Material) -> pygltflib.Material:
         surface = pygltflib.PbrMetallicRoughness(
@@ -193,24 +233,28 @@ class _Writer:
         result.alphaCutoff = None if source.alpha_cutoff is None else float(source.alpha_cutoff)
         strength = max(*source.emission, 1.0)
         result.emissiveFactor = [float(value) / strength for value in source.emission]
-        result.extensions = {"KHR_materials_specular": {"specularFactor": float(source.specular)}}
+        coat: dict[str, Any] = {"specularFactor": float(source.specular)}
+        if source.reflectance != (0.04,) * 3:
+            coat["specularColorFactor"] = [float(value) / 0.04 for value in source.reflectance]
+        for field, name in COAT_TEXTURES.items():
+            if getattr(source, field) is not None:
+                coat[name] = self.info(getattr(source, field))
+        result.extensions = {"KHR_materials_specular": coat}
         if strength > 1.0:
             result.extensions["KHR_materials_emissive_strength"] = {"emissiveStrength": float(strength)}
         for field, name in TEXTURES.items():
             texture = getattr(source, field)
             if texture is not None:
-                info = pygltflib.TextureInfo(index=self.texture(texture), texCoord=0)
+                info = pygltflib.TextureInfo(**self.info(texture))
                 if name == "normalTexture":
-                    info = pygltflib.NormalMaterialTexture(
-                        index=info.index, texCoord=0, scale=float(source.normal_scale)
-                    )
+                    info = pygltflib.NormalMaterialTexture(**self.info(texture), scale=float(source.normal_scale))
                 setattr(surface if hasattr(surface, name) else result, name, info)
         return result
 
     def whole(self) -> bytes:
         document = self.document
         used = {name for material in document.materials for name in material.extensions}
-        document.extensionsUsed = sorted(used)
+        document.extensionsUsed = sorted(used | ({"KHR_texture_transform"} if self.is_transformed else set()))
         document.buffers = [pygltflib.Buffer(byteLength=len(self.data))]
         document.set_binary_blob(bytes(self.data))
         return b"".join(document.save_to_bytes())

@@ -1,0 +1,1 @@
+"""The suite ``clean``: whole sequences by the preset ``clean``."""
