@@ -142,7 +142,7 @@ def test_files_of_frames_tell_the_camera(tmp_path):
     # OpenEXR: the window's middle and width on the plane at 1 m, x right and y up
     assert read.attributes["screenWindowWidth"] == pytest.approx(48 / 60)
     assert np.allclose(read.attributes["screenWindowCenter"], ((24 - 19.5) / 60, (20.25 - 16) / 45))
-    assert read.attributes["PixelAspectRatio"] == pytest.approx(45 / 60)
+    assert read.attributes["pixelAspectRatio"] == pytest.approx(45 / 60)
     ndc = np.concatenate([POINTS, np.ones((len(POINTS), 1))], axis=1) @ camera_matrices(camera)[1]
     assert np.allclose(ndc[:, :2] / ndc[:, 3:] * SIZE, camera.project(POINTS), atol=1e-3)
     assert not list(

@@ -14,6 +14,7 @@ import numpy as np
 
 from warp_gi.errors import OptionError, SceneError, unknown_name
 from warp_gi.files import user_path
+from warp_gi.scene.camera_files import naming_file, read_camera_file
 from warp_gi.scene.pinhole import Camera
 
 if TYPE_CHECKING:
@@ -202,9 +203,20 @@ class CameraPath:
         In place of eye and target it may have "world_from_camera" and "convention", as ``Camera.from_intrinsics``.
         Raises SceneError when the file is missing or not such a path.
         """
-        from warp_gi.scene.camera_files import read_camera_path
+        file = user_path(path)
+        found = read_camera_file(file)
 
-        return read_camera_path(user_path(path))
+        def made() -> CameraPath:
+            path = cls.from_cameras(found.cameras, found.times, found.fps)
+            # as they are: a target further away turns the camera otherwise between keys
+            looks = found.looks or [None] * len(path.keys)
+            keys = [
+                replace(key, eye=look[0], target=look[1], up=look[2]) if look else key
+                for key, look in zip(path.keys, looks, strict=True)
+            ]
+            return replace(path, keys=tuple(keys), name=file.stem)
+
+        return naming_file(file, made)
 
     def save(self, path: str | Path) -> None:
         """Write the path as JSON, in the file's coordinates."""

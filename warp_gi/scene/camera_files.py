@@ -6,17 +6,17 @@ import json
 import math
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from warp_gi.errors import SceneError
-from warp_gi.scene.camera import CameraPath
 from warp_gi.scene.pinhole import Camera
 
 T = TypeVar("T")
+Vec3 = tuple[float, float, float]
 
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 """Camera models of COLMAP that are pinholes, once the distortion is left out."""
@@ -24,8 +24,22 @@ DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 RESOLUTION = (960, 540)
 
 
-def read_camera_path(path: Path) -> CameraPath:
-    """Return the camera path of a JSON file, see ``CameraPath.load``; raises SceneError."""
+@dataclass
+class CameraFile:
+    """What a file says of a camera path."""
+
+    cameras: list[Camera]
+    """The camera of each key, all of one resolution."""
+    times: list[float] | None = None
+    """Times of the keys in seconds; None is a frame each."""
+    fps: float = 24.0
+    """Frames per second."""
+    looks: list[tuple[Vec3, Vec3, Vec3] | None] = field(default_factory=list)
+    """Eye, target and up of each key as the file has them, or None where it has a matrix; empty if all have."""
+
+
+def read_camera_file(path: Path) -> CameraFile:
+    """Return the cameras of a JSON file, see ``CameraPath.load``; raises SceneError."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -33,11 +47,11 @@ def read_camera_path(path: Path) -> CameraPath:
     except ValueError as error:
         raise SceneError(f"camera path {path}: not JSON ({error})") from error
     if isinstance(document, dict) and "frames" in document and "keyframes" not in document:
-        return _checked(path, lambda: _transforms(document, path))
-    return _checked(path, lambda: _keyframes(document, path))
+        return naming_file(path, lambda: _transforms(document, path))
+    return naming_file(path, lambda: _keyframes(document))
 
 
-def _checked(path: Path, read: Callable[[], T]) -> T:
+def naming_file(path: Path, read: Callable[[], T]) -> T:
     """Return what ``read`` does; its errors name the file."""
     try:
         return read()
@@ -49,19 +63,12 @@ def _checked(path: Path, read: Callable[[], T]) -> T:
         raise SceneError(f"camera path {path}: {error}") from error
 
 
-def _keyframes(document: Mapping[str, Any], path: Path) -> CameraPath:
+def _keyframes(document: Mapping[str, Any]) -> CameraFile:
     width, height = (int(size) for size in document.get("resolution", RESOLUTION))
     cameras = [_camera(key, (width, height)) for key in document["keyframes"]]
     times = [float(key.get("time", 0.0)) for key in document["keyframes"]]
     fps = float(document.get("fps", 24.0))
-    keys = []
-    for key, camera, time in zip(document["keyframes"], cameras, times, strict=True):
-        placed = CameraPath.from_cameras([camera], [0.0]).keys[0]
-        if "eye" in key:  # as they are: a target further away turns the camera otherwise between keys
-            placed = replace(placed, eye=_three(key["eye"]), target=_three(key["target"]))
-            placed = replace(placed, up=_three(key.get("up", (0, 1, 0))))
-        keys.append(replace(placed, time=time))
-    return CameraPath(tuple(keys), fps, (width, height), name=path.stem)
+    return CameraFile(cameras, times, fps, [_look(key) if "eye" in key else None for key in document["keyframes"]])
 
 
 def _camera(key: Mapping[str, Any], resolution: tuple[int, int]) -> Camera:
@@ -70,11 +77,11 @@ def _camera(key: Mapping[str, Any], resolution: tuple[int, int]) -> Camera:
     if "K" in key:
         if "world_from_camera" in key:
             return Camera.from_intrinsics(key["K"], key["world_from_camera"], resolution, convention)
-        return Camera.from_intrinsics(key["K"], _looking(key).world_from_camera, resolution, "opengl")
+        return Camera.from_intrinsics(key["K"], Camera.look_at(*_look(key)).world_from_camera, resolution, "opengl")
     if "world_from_camera" in key:
         camera = Camera.from_intrinsics(np.eye(3), key["world_from_camera"], (1, 1), convention)
     else:
-        camera = _looking(key)
+        camera = Camera.look_at(*_look(key))
     right, above = (float(shift) for shift in key.get("lens_shift", (0.0, 0.0)))
     camera = replace(
         camera,
@@ -88,11 +95,12 @@ def _camera(key: Mapping[str, Any], resolution: tuple[int, int]) -> Camera:
     return camera.with_vfov(float(key["vfov"])) if "vfov" in key else camera
 
 
-def _looking(key: Mapping[str, Any]) -> Camera:
-    return Camera.look_at(_three(key["eye"]), _three(key["target"]), _three(key.get("up", (0, 1, 0))))
+def _look(key: Mapping[str, Any]) -> tuple[Vec3, Vec3, Vec3]:
+    """Return eye, target and up of a keyframe."""
+    return _three(key["eye"]), _three(key["target"]), _three(key.get("up", (0, 1, 0)))
 
 
-def _transforms(document: Mapping[str, Any], path: Path) -> CameraPath:
+def _transforms(document: Mapping[str, Any], path: Path) -> CameraFile:
     """Return the cameras of a ``transforms.json``, a frame each; axes are OpenGL's, lengths the file's own."""
     cameras: list[Camera] = []
     sizes: list[tuple[int, int]] = []
@@ -115,9 +123,9 @@ def _transforms(document: Mapping[str, Any], path: Path) -> CameraPath:
         warnings.warn(
             f"camera path {path}: lens distortion ({names}) is not modelled and left out; undistort the pictures to"
             " compare with",
-            stacklevel=5,
+            stacklevel=6,
         )
-    return replace(CameraPath.from_cameras(cameras), name=path.stem)
+    return CameraFile(cameras)
 
 
 def _transforms_camera(values: Mapping[str, Any], resolution: tuple[int, int]) -> Camera:
@@ -135,6 +143,6 @@ def _transforms_camera(values: Mapping[str, Any], resolution: tuple[int, int]) -
     return Camera.from_intrinsics(K, np.array(values["transform_matrix"], np.float64), resolution, "opengl")
 
 
-def _three(values: Any) -> tuple[float, float, float]:
+def _three(values: Any) -> Vec3:
     x, y, z = (float(v) for v in values)
     return x, y, z

@@ -40,7 +40,7 @@ _CHANNELS = {
 }
 _BUFFER_OF_CHANNEL = {channel: name for name, channels in _CHANNELS.items() for channel in channels}
 _ALWAYS_FLOAT = {"position", "depth", "motion", "object_id", "material_id", "variance"}
-_ARRAYS = {16: "matrix", 9: "matrix33", 2: "float[2]"}
+_OIIO_NAMES = {"PixelAspectRatio": "pixelAspectRatio"}  # attributes that OpenImageIO calls otherwise than OpenEXR
 _SHAPES = {"matrix": (4, 4), "matrix33": (3, 3), "float2": (2,), "float[2]": (2,)}
 _INTEGER = {"object_id", "material_id"}
 
@@ -172,7 +172,8 @@ def read_exr(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Attribu
     for item in spec.extra_attribs:
         value: Any = item.value
         shape = _SHAPES.get(str(item.type))
-        attributes[item.name] = value if shape is None else np.array(value, np.float32).reshape(shape)
+        value = value if shape is None else np.array(value, np.float32).reshape(shape)
+        attributes[_OIIO_NAMES.get(item.name, item.name)] = value
     return buffers, attributes, {buffer: formats[indices[0]] for buffer, indices in groups.items()}
 
 

@@ -145,7 +145,7 @@ def frame_attributes(
         "worldToCamera": world_to_camera,
         "worldToNDC": world_to_ndc,
         "K": camera.intrinsics,
-        "PixelAspectRatio": float(camera.pixel_aspect),
+        "pixelAspectRatio": float(camera.pixel_aspect),
         "screenWindowWidth": float(2 * half_width),
         "screenWindowCenter": 2 * np.multiply(camera.lens_shift, (half_width, half_height)),
         PREFIX + "precision": precision,
@@ -222,7 +222,7 @@ def read_frame(path: str | Path) -> FrameFile:
         camera = Camera(world_from_camera, float(attributes["hfov"]), (width, height), offset=(x, y, z))
         if isinstance(K := attributes.get("K"), np.ndarray):
             shift = (0.5 - float(K[0, 2]) / width, float(K[1, 2]) / height - 0.5)
-            camera = replace(camera, lens_shift=shift, pixel_aspect=float(attributes["PixelAspectRatio"]))
+            camera = replace(camera, lens_shift=shift, pixel_aspect=float(attributes["pixelAspectRatio"]))
     return FrameFile(
         buffers,
         formats,
