@@ -86,6 +86,11 @@ def test_another_sky_other_code_and_another_view_are_other_files(monkeypatch, tm
     assert folder.path(CACHE, scene, camera, CPU, 1) != before
     path = gi.CameraPath.still(camera)
     assert len({views_hash(one) for one in (None, camera, path, gi.CameraPath.orbit((0, 1, 0), 2.0))}) == 3
+    lenses = [camera, replace(camera, lens_shift=(0.1, 0.0)), replace(camera, pixel_aspect=2.0)]
+    assert len({views_hash(lens) for lens in lenses}) == 3
+    before = folder.path(CACHE, scene, camera, CPU, 1)
+    scene.offset = np.array([1.0, 0.0, 0.0])  # of a recentred scene: its bake says so
+    assert folder.path(CACHE, scene, camera, CPU, 1) != before
 
 
 def test_a_damaged_file_is_made_anew_with_one_line(keeps_all, tmp_path, caplog):

@@ -360,6 +360,15 @@ def test_a_camera_without_an_aspect_ratio_keeps_its_yfov():
     assert camera.at_resolution(200, 500).at_resolution(*camera.resolution).hfov == pytest.approx(camera.hfov)
 
 
+def test_a_camera_that_is_a_reflection_is_left_out_with_a_line(tmp_path):
+    glb = square()
+    glb.add("nodes", {"camera": glb.add("cameras", {"type": "perspective", "perspective": {"yfov": 0.8}})})
+    glb.json["nodes"][-1]["scale"] = [-1, 1, 1]
+    glb.json["scenes"] = [{"nodes": [0, 1]}]
+    with pytest.warns(UserWarning, match="is a reflection.*it is left out"):
+        assert not loaded(glb, tmp_path).cameras
+
+
 def test_an_orthographic_camera_is_named():
     with pytest.warns(gi.UnsupportedWarning, match=r"orthographic cameras \(camera 0\)"):
         assert not gi.load_scene(CASES / "gltf-camera-aspect" / "ortho.glb").cameras

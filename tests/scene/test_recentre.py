@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
+import trimesh
 
 import warp_gi as gi
 from warp_gi.cli import main as cli
@@ -72,6 +73,22 @@ def write_glb(path, offset, with_camera=True):
     return path
 
 
+def write_ply(path, offset):
+    points, quads = stair()
+    lines = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *(f"property double {c}" for c in "xyz")]
+    lines += [f"element face {len(quads)}", "property list uchar int vertex_indices", "end_header"]
+    lines += [f"{x!r} {y!r} {z!r}" for x, y, z in (points + offset).tolist()]
+    path.write_text("\n".join(lines + [f"4 {a} {b} {c} {d}" for a, b, c, d in quads]) + "\n")
+    return path
+
+
+def trimesh_of(path, offset):
+    """Return a scene of trimesh in place of a file."""
+    points, quads = stair()
+    faces = np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])
+    return trimesh.Scene([trimesh.Trimesh(points + offset, faces, process=False)])
+
+
 def world_points(scene):
     return scene.offset + np.asarray(scene._flat.points, np.float64)
 
@@ -112,10 +129,10 @@ def test_it_can_be_asked_for_and_refused(tmp_path):
     assert not far.offset.any() and far.bounds.max() > 5e6
 
 
-@pytest.mark.parametrize("kind", ["obj", "glb"])
+@pytest.mark.parametrize("kind", ["obj", "glb", "ply", "trimesh"])
 def test_a_far_scene_looks_as_a_near_one(tmp_path, kind):
     """Cameras are given in the file's coordinates, and stand where they stood before the stair."""
-    write = {"obj": write_obj, "glb": write_glb}[kind]
+    write = {"obj": write_obj, "glb": write_glb, "ply": write_ply, "trimesh": trimesh_of}[kind]
     near = gi.load_scene(write(tmp_path / f"near.{kind}", np.zeros(3)), 1.0)
     far = gi.load_scene(write(tmp_path / f"far.{kind}", UTM), 1.0, recentre=True)
     here = depths(near, gi.Camera.look_at(EYE, TARGET))
@@ -152,6 +169,21 @@ def test_a_frame_file_tells_the_offset(tmp_path):
     np.testing.assert_allclose(again.numpy("depth"), frame.numpy("depth"), atol=1e-3)
     assert not list(gi.render(scene, camera, SMALL, output=tmp_path / "a.exr", resume=True))
     assert not gi.read_frame(tmp_path / "a.exr").offset.tolist() == [0, 0, 0]
+
+
+def test_objects_of_trimesh_are_scaled_turned_and_recentred():
+    with pytest.warns(UserWarning, match="'the trimesh object' lies .* m from its origin"):
+        scene = gi.load_scene(trimesh_of(None, 1000 * UTM[[0, 2, 1]]), scale=0.001, up="z")
+    points = 0.001 * (stair()[0] + 1000 * UTM[[0, 2, 1]]) @ [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    assert np.abs(world_points(scene).min(axis=0) - points.min(axis=0)).max() < 1e-6
+    assert all(mesh.points.dtype == np.float32 for node in scene.nodes for mesh in node.meshes)
+
+
+def test_what_a_file_uses_is_told_of_far_scenes_too(tmp_path):
+    file = write_obj(tmp_path / "far.obj", UTM)
+    file.write_text(file.read_text() + "l 1 2\n")
+    with pytest.warns(gi.UnsupportedWarning, match="points and lines"):
+        assert gi.load_scene(file, recentre=True, smooth=30.0, scale=2.0, up="z").offset.any()
 
 
 def test_scale_and_animation(tmp_path):

@@ -75,6 +75,19 @@ def test_a_denoised_picture_has_no_background_either(samples):
     assert cut["beauty"][edge].max() <= 1.05  # the sky of radiance 2 is not in them
 
 
+@pytest.mark.parametrize("edge_samples", [0, 4])
+def test_the_average_of_pictures_has_no_background_either(edge_samples):
+    """Over frames of a camera that moves by half pixels: the last picture is read beside the surface's edge."""
+    denoise = gi.SpatioTemporal(blend=0.1, edge_samples=edge_samples)
+    pipeline = gi.Pipeline(spp=1, camera_samples=1, denoise=denoise, background=False)
+    places = [0.05 * k for k in range(4)]
+    cameras = [gi.Camera.look_at((x, x, 3), (x, x, 0), hfov=40.0, resolution=SIZE) for x in places]
+    for frame in gi.render(half_plane(), gi.CameraPath.from_cameras(cameras), pipeline):
+        beauty = frame.numpy("beauty")
+        assert (beauty <= np.array([1.0, 0.5, 0.2]) * 1.05).all()  # the sky's radiance is 2
+        assert (beauty[:3, :4] == 0).all() and beauty[-2:, -4:].min() > 0.15
+
+
 def test_files_have_the_channel_a(tmp_path):
     pipeline = gi.Pipeline(spp=4)
     (frame,) = gi.render(half_plane(), CAMERA, pipeline, output=tmp_path / "a.exr")
