@@ -218,7 +218,8 @@ def test_stages_add_up_and_leave_no_launch_out(monkeypatch, preset):
         scheduler.frame(0)
         monkeypatch.setattr(wp, "launch", launch_and_tick)
         for module in (warp_gi.scheduler, warp_gi.frame, warp_gi.launch):
-            monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: ticks[0], process_time=lambda: 0))
+            clock = SimpleNamespace(perf_counter=lambda: ticks[0], thread_time=lambda: 0)
+            monkeypatch.setattr(module, "time", clock)
         for index in (1, 2):
             before = ticks[0]
             timings = scheduler.frame(index).timings
