@@ -20,6 +20,7 @@ from warp_gi.errors import SceneError as SceneError
 from warp_gi.errors import UnsupportedWarning as UnsupportedWarning
 from warp_gi.estimator import Estimator as Estimator
 from warp_gi.frame import Frame as Frame
+from warp_gi.kept import BakeFolder as BakeFolder
 from warp_gi.launch import set_threads as set_threads
 from warp_gi.pipeline import Pipeline as Pipeline
 from warp_gi.primary import Primary as Primary

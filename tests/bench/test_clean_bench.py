@@ -228,7 +228,11 @@ def test_rows_are_declared_and_of_every_contender(rows):
     said = [(row["renderer"], row["spp"]) for row in found]
     has_oidn = (contenders.OIDN, 1) in said
     sides = [contenders.PATH, contenders.FILTERED, *[contenders.OIDN] * has_oidn]
-    assert said == [(contenders.CLEAN, 1), (contenders.BLENDED, 1), *((side, spp) for spp in (1, 16) for side in sides)]
+    assert said == [
+        (contenders.CLEAN, 1),
+        (contenders.UNBLENDED, 1),
+        *((side, spp) for spp in (1, 16) for side in sides),
+    ]
     for row in found:
         assert 0 < row["FLIP"] < 1 and 0.7 < row["mean"] < 1.3 and row["us a pixel"] > 0 and row["flicker"] > 0
     clean, path = (named(found, sequences.SEQUENCES, renderer=name)[0] for name in (contenders.CLEAN, contenders.PATH))

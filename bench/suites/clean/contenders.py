@@ -16,9 +16,9 @@ from warp_gi.bench.suites.clean.cases import Judged
 from warp_gi.denoise import Denoiser
 from warp_gi.errors import OptionError
 
-CLEAN, BLENDED = "clean", "clean, blend 0.25"
+CLEAN, UNBLENDED = "clean", "clean, blend 1"
 PATH, FILTERED, OIDN = "path", "path, spatiotemporal", "path, OIDN"
-BLEND = 0.25
+BLEND = 1.0
 HISTORY = {4: 16, 16: 2, 64: 2}
 """Frames before the middle one that paths of so many samples render, for the filter over frames; of one sample all."""
 FEW = 4
@@ -140,7 +140,7 @@ class Contender:
                 self._shots(name).add(index, side.picture, more, judged)
 
     def _shots(self, name: str) -> Shots:
-        family = CLEAN if name == BLENDED else name
+        family = CLEAN if name == UNBLENDED else name
         return self.shots.setdefault(name, Shots(name, self.pipeline.spp, family))
 
     @property
@@ -150,12 +150,12 @@ class Contender:
 
 
 def cleans(count: int) -> list[Contender]:
-    """Return the preset ``clean``, and with pictures averaged over frames, for so many frames."""
+    """Return the preset ``clean``, and without its average of pictures, for so many frames."""
     clean = gi.Pipeline.preset("clean")
     assert isinstance(clean.denoise, gi.SpatioTemporal)
-    blended = replace(clean, denoise=replace(clean.denoise, blend=BLEND))
+    unblended = replace(clean, denoise=replace(clean.denoise, blend=BLEND))
     frames = tuple(range(count))
-    return [Contender(CLEAN, clean, frames), Contender(BLENDED, blended, frames)]
+    return [Contender(CLEAN, clean, frames), Contender(UNBLENDED, unblended, frames)]
 
 
 def paths(judged: Judged, samples: Iterable[int] = (1, *HISTORY)) -> list[Contender]:
@@ -163,7 +163,7 @@ def paths(judged: Judged, samples: Iterable[int] = (1, *HISTORY)) -> list[Conten
 
     One sample renders every frame; more of them the middle one with some before it, and few of them the first.
     """
-    sides = {FILTERED: gi.SpatioTemporal(first_samples=1), OIDN: gi.Oidn()}
+    sides = {FILTERED: gi.SpatioTemporal(first_samples=1), OIDN: gi.Oidn(quality="high", accumulate=False)}
     found = []
     for spp in samples:
         begin = max(judged.middle - HISTORY.get(spp, judged.middle), 0)

@@ -6,7 +6,7 @@ from typing import Any
 
 from warp_gi.bench.publish.figures import Figure, Grid, GridColumn, Region, Text
 from warp_gi.bench.suites.clean.columns import COLUMNS
-from warp_gi.bench.suites.clean.contenders import BLENDED, CLEAN, FILTERED, OIDN, PATH
+from warp_gi.bench.suites.clean.contenders import CLEAN, FILTERED, OIDN, PATH, UNBLENDED
 from warp_gi.bench.suites.clean.first import COLD, FIRST, WARM
 from warp_gi.bench.suites.clean.peers import TABLE as PEERS
 from warp_gi.bench.suites.clean.sequences import BESIDE, REFERENCE, SEQUENCES
@@ -23,7 +23,7 @@ def _beside(header: str, key: str, renderer: str = CLEAN, **more: Any) -> GridCo
 
 
 def _left(renderer: str, later: int, **more: Any) -> GridColumn:
-    name = "blended, " if renderer == BLENDED else ""
+    name = "not averaged, " if renderer == UNBLENDED else ""
     only = {"renderer": renderer, "frames later": later}
     return GridColumn(f"{name}{later} later, %", Figure("old light left", only, scale=100.0, **more))
 
@@ -33,7 +33,7 @@ _ERRORS = Grid(
     "case",
     (
         _of("clean: FLIP", "FLIP", CLEAN, at_most="most FLIP"),
-        _of("blended", "FLIP", BLENDED),
+        _of("not averaged", "FLIP", UNBLENDED),
         _of("path 1, OIDN", "FLIP", OIDN),
         _of("path 16, OIDN", "FLIP", OIDN, 16),
         GridColumn("reference, halves", Figure("FLIP of its halves", table=REFERENCE)),
@@ -65,12 +65,12 @@ _FLICKER = Grid(
     "case",
     (
         _of("clean", "flicker", CLEAN),
-        _of("blended", "flicker", BLENDED),
+        _of("not averaged", "flicker", UNBLENDED),
         _of("path 1, filter", "flicker", FILTERED),
         _of("path 1, OIDN", "flicker", OIDN),
         GridColumn("reference", Figure("flicker of the reference", table=REFERENCE)),
         _beside("clean over OIDN", "flicker / OIDN", at_most="most of flicker"),
-        _beside("blended", "flicker / OIDN", BLENDED, at_most="most of flicker"),
+        _beside("not averaged", "flicker / OIDN", UNBLENDED, at_most="most of flicker"),
     ),
     SEQUENCES,
 )
@@ -83,8 +83,8 @@ _CLEAN = Region(
         Text(
             "Frame 23 of 48. FLIP is against a reference whose own halves differ as told; where these differ by more "
             "than 0.05 it is cleaned by OIDN, as are the halves of the next column. The mean is of all 48 frames, and "
-            'of the first. "Blended" is `denoise.blend` 0.25. How much more alike errors on flat walls are two pixels '
-            "apart than one, which is 1 for a grid, 0 for noise and below it for what is smooth: {pattern}.",
+            'of the first. "Not averaged" is `denoise.blend` 1. How much more alike errors on flat walls are two '
+            "pixels apart than one, which is 1 for a grid, 0 for noise and below it for what is smooth: {pattern}.",
             {"pattern": Figure("pattern", {"renderer": CLEAN}, at_most="most pattern")},
             SEQUENCES,
         ),
@@ -110,8 +110,8 @@ _CLEAN = Region(
                 _left(CLEAN, 0),
                 _left(CLEAN, SOON, at_most="most left"),
                 _left(CLEAN, LONG, at_most="most left"),
-                _left(BLENDED, SOON),
-                _left(BLENDED, LONG),
+                _left(UNBLENDED, SOON),
+                _left(UNBLENDED, LONG),
             ),
             SWITCHED,
         ),

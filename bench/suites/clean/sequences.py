@@ -11,7 +11,7 @@ from warp_gi.bench.harness.gallery import CLOSED, Gallery, PictureSet
 from warp_gi.bench.harness.measure import PeakMemory, Row, attempt, median_and_spread
 from warp_gi.bench.suites.clean import measures
 from warp_gi.bench.suites.clean.cases import BUILT_IN, FROM_FILES, MOVING, QUICK, SequenceCase
-from warp_gi.bench.suites.clean.contenders import BLENDED, CLEAN, OIDN, PATH, Shots, cleans, paths, take_turns
+from warp_gi.bench.suites.clean.contenders import CLEAN, OIDN, PATH, UNBLENDED, Shots, cleans, paths, take_turns
 from warp_gi.bench.suites.clean.references import Guides, Truth, truth
 
 SEQUENCES, BESIDE, REFERENCE = "sequences", "clean beside path, OIDN", "references"
@@ -135,7 +135,7 @@ def beside_rows(case: SequenceCase, found: Mapping[tuple[str, int], Row]) -> lis
     """Return rows of ``clean`` over paths with OIDN: flicker, FLIP at ten times the seconds, seconds of equal FLIP."""
     others = [row for (name, _), row in sorted(found.items()) if name == OIDN]
     rows: list[Row] = []
-    for name in (CLEAN, BLENDED):
+    for name in (CLEAN, UNBLENDED):
         ours = next(row for (one, _), row in found.items() if one == name)
         row: Row = {"table": BESIDE, "case": case.name, "renderer": name}
         if not others:

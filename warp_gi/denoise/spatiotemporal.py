@@ -1,21 +1,19 @@
-"""Denoisers: what turns a composed, noisy frame into the picture that is shown."""
+"""A denoiser over frames, then over pixels."""
 
 from __future__ import annotations
 
-import importlib
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import warp as wp
 
-from warp_gi import launch
-from warp_gi.errors import OptionError, check_whole, one_line, unknown_name
+from warp_gi.denoise.base import Denoiser
+from warp_gi.denoise.history import ApartHistory, History, light_of
+from warp_gi.errors import OptionError, check_whole
 from warp_gi.kernels import apart_lights, denoise, denoise_apart, denoise_edges
 from warp_gi.scene.apart import ApartLights, has_apart_lights
-from warp_gi.stateful import Ahead, Stateful
 
 if TYPE_CHECKING:
     from warp_gi.baking import Bake
@@ -23,148 +21,11 @@ if TYPE_CHECKING:
     from warp_gi.scene.baked import BakedScene
     from warp_gi.scene.scene import Scene
 
-__all__ = ["DENOISERS", "Denoiser", "Oidn", "SpatioTemporal"]
-
 MOST_LEVELS = 8
 LONG = 4.0
 """Frames from which on an average knows its variance, if the first one has as many samples as others."""
 CLIP = 1.5
 """Standard deviations of the pixels around a pixel, to which the last picture is limited in it."""
-QUALITIES = ("high", "balanced", "fast")
-
-
-@dataclass(frozen=True)
-class Denoiser(Stateful):
-    """Base of every denoiser; a frozen dataclass of plain settings.
-
-    ``start`` makes the state before the first frame. ``apply`` fills a frame's ``beauty`` and returns the state for
-    the next frame, leaving the last one as it is. A denoiser keeps nothing anywhere but in its state.
-    """
-
-    wants_lobes: ClassVar[bool] = False
-    """Whether ``apply`` reads the guides and the separated light (``Frame.lobes``)."""
-
-    @property
-    def parts_lights(self) -> bool:
-        """Whether it wants the diffuse light of suns and of lights without size apart (``Lobes.apart``)."""
-        return False
-
-    def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
-        """Return whether a frame depends on those before it; True, unless a denoiser promises that it does not."""
-        return True
-
-    def bake_key(self, scene: Scene | BakedScene) -> str:
-        """Return the same for every scene: a denoiser learns of a change from the frames."""
-        return "any scene"
-
-    def samples(self, frame: Frame, state: Any) -> int:
-        """Return the number of samples a pixel that a frame is to take, from the pipeline's own: ``frame.settings``."""
-        return frame.settings.spp
-
-    def apply(self, frame: Frame, state: Any) -> Any:
-        """Fill ``frame["beauty"]`` from ``frame["noisy"]`` and the other buffers, and return the new state."""
-        raise NotImplementedError
-
-
-@dataclass(frozen=True)
-class ApartHistory:
-    """What ``SpatioTemporal`` keeps of the light of suns and of lights without size."""
-
-    average: wp.array
-    """Light and the number of frames in it, vec4 [height * width]."""
-    directions: np.ndarray
-    """Unit directions towards the suns, float64 [suns, 3]."""
-
-
-@dataclass(frozen=True)
-class History:
-    """State of ``SpatioTemporal``: what it keeps of the last frame."""
-
-    index: int
-    """Number of the frame."""
-    resolution: tuple[int, int]
-    """Width and height of the frame in pixels."""
-    scene: tuple[Scene | BakedScene, str]
-    """Scene and the hash of what must not have changed: ``light_of``."""
-    guides: denoise.Guides
-    """Geometry and colours of the surfaces in the frame's pixels."""
-    average: denoise.Signals
-    """Averages over frames of diffuse and glossy light, and the number of frames in them."""
-    apart: ApartHistory | None = None
-    """Diffuse light of lights that are apart, if there are any."""
-    picture: wp.array | None = None
-    """Average of the reflected light of pictures, vec3 [height * width], if pictures are averaged."""
-
-    @staticmethod
-    def empty(scene: Scene | BakedScene, device: wp.Device) -> History:
-        """Return the state before the first frame, which leads to none."""
-        return History(-1, (0, 0), (scene, ""), _empty(denoise.Guides, device), _empty(denoise.Signals, device))
-
-    def saved_arrays(self) -> dict[str, np.ndarray]:
-        """Return what the next frame reads, as arrays."""
-        parts = {f"{name}": getattr(self.guides, name) for name in READ_GUIDES}
-        parts |= {name: getattr(self.average, name) for name in launch.fields_of(denoise.Signals)}
-        parts |= {} if self.picture is None else {"picture": self.picture}
-        parts |= {} if self.apart is None else {"apart": self.apart.average}
-        frame = {
-            "frame": np.array([self.index, *self.resolution]),
-            "light": np.frombuffer(self.scene[1].encode(), np.uint8),
-        }
-        if self.apart is not None:
-            frame["apart_directions"] = self.apart.directions
-        return frame | {name: array.numpy() for name, array in parts.items()}
-
-    def with_saved_arrays(self, arrays: Mapping[str, np.ndarray]) -> History:
-        """Return the state that ``saved_arrays`` is of; raises KeyError or ValueError where it cannot be one."""
-        device = self.average.length.device
-        index, *size = (int(number) for number in arrays["frame"].reshape(3))
-        guides, average = _empty(denoise.Guides, device), _empty(denoise.Signals, device)
-        for struct, name in [
-            *((guides, n) for n in READ_GUIDES),
-            *((average, n) for n in launch.fields_of(denoise.Signals)),
-        ]:
-            setattr(struct, name, _loaded(arrays[name], getattr(struct, name).dtype, size[0] * size[1], device))
-        picture, apart = None, None
-        if "picture" in arrays:
-            picture = _loaded(arrays["picture"], wp.vec3, size[0] * size[1], device)
-        if "apart" in arrays:
-            lights = _loaded(arrays["apart"], wp.vec4, size[0] * size[1], device)
-            apart = ApartHistory(lights, arrays["apart_directions"].reshape(-1, 3))
-        light = arrays["light"].tobytes().decode("ascii")
-        return History(index, (size[0], size[1]), (self.scene[0], light), guides, average, apart, picture)
-
-    def leads_to(self, frame: Frame) -> bool:
-        """Return whether the frame's motion is towards the last frame, of the same scene and size."""
-        return (
-            frame.previous_index == self.index != frame.index
-            and frame.camera.resolution == self.resolution
-            and frame.scene is self.scene[0]
-            and light_of(frame.scene) == self.scene[1]
-        )
-
-
-READ_GUIDES = ("guide_object", "guide_normal", "guide_position")
-"""Guides that the next frame reads (``denoise.same_surface``)."""
-
-
-def _empty(struct: type[launch.Struct], device: wp.Device) -> launch.Struct:
-    """Return a kernel struct whose arrays have no items."""
-    empty = struct()
-    for name, variable in struct.vars.items():  # type: ignore[attr-defined]
-        setattr(empty, name, wp.empty(0, dtype=variable.type.dtype, device=device))
-    return empty
-
-
-def _loaded(array: np.ndarray, dtype: type, count: int, device: wp.Device) -> wp.array:
-    """Return an array on a device; raises ValueError unless it has ``count`` items."""
-    if len(array) != count:
-        raise ValueError(f"{len(array)} pixels instead of {count}")
-    return wp.array(array, dtype=dtype, device=device)
-
-
-def light_of(scene: Scene | BakedScene) -> str:
-    """Return a hash of a scene's light; of all but the sky where that changes over time, little by little."""
-    return scene.contents_hash if scene.is_sky_animated else scene.hash
 
 
 @dataclass(frozen=True)
@@ -426,110 +287,3 @@ class SpatioTemporal(Denoiser):
         signals.moments = wp.empty(width * height, dtype=wp.vec2, device=frame.device)
         signals.length = wp.empty(width * height, dtype=wp.vec2, device=frame.device)
         return signals
-
-
-@dataclass(frozen=True)
-class OidnFilter(SpatioTemporal):
-    """``SpatioTemporal`` with Open Image Denoise in place of its filter over pixels."""
-
-    apart_frames: int = 0
-    library: Any = None
-    quality: str = "fast"
-
-    def _filtered(
-        self,
-        frame: Frame,
-        settings: denoise.DenoiseSettings,
-        guides: denoise.Guides,
-        average: denoise.Signals,
-        more: int,
-    ) -> denoise.Filtered:
-        """Return both averages filtered as pictures, with normals as guides that have no noise."""
-        width, height = frame.camera.resolution
-        normal, known = guides.guide_normal.numpy().reshape(height, width, 3), average.length.numpy() > 0
-        filtered = denoise.Filtered()
-        for lobe, name in enumerate(("diffuse", "glossy")):
-            light = getattr(average, name).numpy().reshape(height, width, 3)
-            white = np.ones_like(light)  # albedo: it takes no normals without
-            clean = self.library.denoise(light, white, normal, hdr=True, clean_aux=True, quality=self.quality)
-            spread = np.where(known[:, lobe], 0.0, -1.0)  # where light is not known, as in denoise.Filtered
-            values = np.concatenate([clean.reshape(-1, 3), spread[:, None]], axis=1).astype(np.float32)
-            setattr(filtered, name, launch.on_device(values, wp.vec4, frame.device))
-        return filtered
-
-
-@dataclass(frozen=True)
-class OidnState:
-    """State of ``Oidn``."""
-
-    library: Any = field(metadata={"derived": True})
-    """The module of Open Image Denoise."""
-    history: History
-    """What it keeps of the last frame, if it accumulates."""
-
-
-@dataclass(frozen=True)
-class Oidn(Denoiser):
-    """Intel Open Image Denoise of the average over frames of ``SpatioTemporal``, or of each frame for itself.
-
-    What is filtered of an average is light before it meets the surfaces' colours, diffuse and glossy apart; edges and
-    the average of pictures are those of ``SpatioTemporal``. It runs on the CPU, on threads of its own, whatever
-    the frame's device. ``start`` raises OptionError where it is not installed.
-    """
-
-    wants_lobes: ClassVar[bool] = True
-
-    quality: str = "fast"
-    """Quality of Open Image Denoise: "high", "balanced" or "fast". Of a frame for itself "high" pays."""
-    accumulate: bool = True
-    """Whether it denoises the average over frames. False is each frame for itself, with albedo and normals as guides:
-    it flickers more, and loses light in dark frames of few samples."""
-
-    def validate(self) -> None:
-        """Raise OptionError for an unknown quality."""
-        if self.quality not in QUALITIES:
-            raise unknown_name("quality", self.quality, QUALITIES)
-
-    def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
-        """Return whether it accumulates; else the state is the library alone."""
-        return self.accumulate
-
-    @property
-    def saves_state(self) -> bool:
-        """True: a file holds the average."""
-        return True
-
-    def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
-        """Return the kernels of the average and of edges."""
-        return OidnFilter().kernels(scene) if self.accumulate else ()
-
-    def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> OidnState:
-        """Return the library and a history of no frame; raises OptionError where it is not installed."""
-        try:
-            return OidnState(importlib.import_module("pyoidn"), History.empty(scene, wp.get_device(device)))
-        except (ImportError, OSError) as error:
-            message = f"Open Image Denoise is not here ({error}); pip install 'warp-gi[denoise]'"
-            raise OptionError(one_line(message)) from error
-
-    def apply(self, frame: Frame, state: OidnState) -> OidnState:
-        """Fill ``frame["beauty"]``: emission as it is, and all other light denoised."""
-        if self.accumulate:
-            accumulating = OidnFilter(library=state.library, quality=self.quality)
-            return replace(state, history=accumulating.apply(frame, state.history))
-        emission = frame.numpy("emission")
-        noisy = np.maximum(frame.numpy("noisy") - emission, 0.0)
-        albedo = np.clip(frame.numpy("albedo"), 0.0, 1.0)
-        light = state.library.denoise(noisy, albedo, frame.numpy("normal"), hdr=True, quality=self.quality)
-        frame["beauty"].assign((emission + light).reshape(-1, 3))
-        return state
-
-
-DENOISERS: dict[str, type[Denoiser]] = {"oidn": Oidn, "spatiotemporal": SpatioTemporal}
-"""Classes that a pipeline's ``denoise`` may name."""
-
-
-def denoiser_named(name: str) -> Denoiser:
-    """Return the denoiser of that name with its defaults; raises OptionError for an unknown name."""
-    if name not in DENOISERS:
-        raise unknown_name("denoiser", name, DENOISERS)
-    return DENOISERS[name]()
