@@ -104,15 +104,16 @@ def sunny_sponza() -> gi.Scene:
     return scene
 
 
+INTO_ROOM = (0.45, 0.1, -0.45)
 BUILT_IN = (
-    SequenceCase("atrium", size=LARGE, most_flip=0.165, within=0.02, most_seconds=0.85),
+    SequenceCase("atrium", most_flip=0.18, within=0.02),
     SequenceCase("street"),
     SequenceCase("warehouse"),
     SequenceCase("two_rooms", within=0.02),
     SequenceCase("cornell_box", within=0.02),
 )
 FROM_FILES = (
-    SequenceCase("living_room", move=(0.45, 0.1, -0.45), size=LARGE, most_flip=0.06, within=0.02, most_seconds=0.45),
+    SequenceCase("living_room", move=INTO_ROOM, most_flip=0.06, within=0.02),
     SequenceCase("modern_hall", move=(-0.6, 0.0, -0.35), most_flip=0.07, within=0.02),
     SequenceCase("sponza_courtyard", move=(2.0, 0.0, 0.0), reference_spp=512),
     SequenceCase("sponza", "Sponza, sun", (2.0, 0.0, 0.0), sunny_sponza, reference_spp=512),
@@ -121,6 +122,10 @@ FROM_FILES = (
 MOVING = (
     SequenceCase("atrium", "atrium, sky turns", build=turning_atrium),
     SequenceCase("strobe", "crate slides", (-0.4, 0.0, -0.3), sliding_crate),
+)
+IN_LARGE = (
+    SequenceCase("atrium", "atrium, 640x360", size=LARGE, most_flip=0.165, within=0.02, most_seconds=0.85),
+    SequenceCase("living_room", "living room, 640x360", INTO_ROOM, None, LARGE, within=0.02, most_seconds=0.45),
 )
 QUICK = (SequenceCase("cornell_box"),)
 

@@ -10,7 +10,7 @@ import numpy as np
 from warp_gi.bench.harness.gallery import CLOSED, Gallery, PictureSet
 from warp_gi.bench.harness.measure import PeakMemory, Row, attempt, median_and_spread
 from warp_gi.bench.suites.clean import measures
-from warp_gi.bench.suites.clean.cases import BUILT_IN, FROM_FILES, MOVING, QUICK, SequenceCase
+from warp_gi.bench.suites.clean.cases import BUILT_IN, FROM_FILES, IN_LARGE, MOVING, QUICK, SequenceCase
 from warp_gi.bench.suites.clean.contenders import CLEAN, OIDN, PATH, UNBLENDED, Shots, cleans, paths, take_turns
 from warp_gi.bench.suites.clean.references import Guides, Truth, truth
 
@@ -38,6 +38,11 @@ def built_in_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[R
 def file_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
     """Return the rows of the scenes of files; none if ``quick``."""
     return all_rows(() if quick else FROM_FILES, quick, device, gallery)
+
+
+def large_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
+    """Return the rows of large pictures; none if ``quick``."""
+    return all_rows(() if quick else IN_LARGE, quick, device, gallery)
 
 
 def moving_rows(quick: bool, device: str, gallery: Gallery = CLOSED) -> list[Row]:
@@ -187,7 +192,7 @@ def reference_rows(case: SequenceCase, truths: Truths, guides: Guides) -> list[R
 def reference_part(quick: bool, device: str) -> list[Row]:
     """Return the rows of the references alone, which are kept from then on: a busy machine can make them."""
     rows: list[Row] = []
-    for case in QUICK if quick else (*BUILT_IN, *FROM_FILES, *MOVING):
+    for case in QUICK if quick else (*BUILT_IN, *FROM_FILES, *MOVING, *IN_LARGE):
         if case.missing:
             continue
         small = case.small(QUICK_SIZE, QUICK_LAST, QUICK_SPP) if quick else case
