@@ -1,8 +1,8 @@
 """Whole sequences by the preset ``clean``: error, flicker, light and time beside paths, denoisers, other renderers.
 
-Parts: ``built-in``, ``files``, ``moving`` and ``large`` sequences; ``switched``, a light that goes off and on; ``first``, the
-command of the README; ``peers``, other renderers. ``references`` alone makes the references that all of them compare
-with; they are kept, and a busy machine can make them.
+Parts: ``built-in``, ``files``, ``moving`` and ``large`` sequences; ``switched``, a light that goes off and on;
+``first``, the command of the README; ``peers``, other renderers. ``references`` alone makes the references that all of
+them compare with; they are kept, and a busy machine can make them.
 """
 
 from __future__ import annotations
