@@ -203,3 +203,55 @@ def test_the_commands_keep_bakes_unless_told_not_to(keeps_all, monkeypatch, tmp_
     monkeypatch.setattr(SurfaceCache, "bake", lambda *_: pytest.fail("the kept bake was not used"))
     assert main(render) == 0
     capsys.readouterr()
+
+
+def test_without_a_camera_the_scene_s_own_decide(tmp_path):
+    scene, camera = box()
+    folder = kept.BakeFolder(tmp_path)
+    before = folder.path(CACHE, scene, None, CPU, 1)
+    assert before == folder.path(CACHE, scene, None, CPU, 1)
+    scene.cameras["main"] = replace(camera, hfov=20.0)
+    assert folder.path(CACHE, scene, None, CPU, 1) != before
+
+
+def test_files_that_are_not_the_folder_s_own_stay(keeps_all, tmp_path):
+    """A state, a bake of one's own: a folder of bakes may be one that holds other things."""
+    others = [tmp_path / "shot.state.safetensors", tmp_path / "mine.safetensors"]
+    for file in others:
+        file.write_bytes(bytes(10_000))
+        os.utime(file, (1, 1))
+    scene, camera = box()
+    folder = kept.BakeFolder(tmp_path, most_bytes=9000)
+    for seed in range(4):
+        folder.bake(CACHE, scene, camera, CPU, seed, made)
+    assert all(file.exists() for file in others)
+    assert 1 <= len(list(tmp_path.glob("SurfaceCache-*"))) < 4 and folder.path(CACHE, scene, camera, CPU, 3).exists()
+
+
+def test_a_home_is_known_by_its_sign(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv(kept.VARIABLE, "~/bakes")
+    assert gi.BakeFolder().folder == tmp_path / "bakes" and gi.BakeFolder("~/other").folder == tmp_path / "other"
+    monkeypatch.delenv(kept.VARIABLE)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr("pathlib.Path.home", lambda: (_ for _ in ()).throw(RuntimeError("no home")))
+    assert gi.BakeFolder().folder.name == "bakes"
+
+
+class Own(SurfaceCache):
+    """A cache of somebody else, which says nothing of its settings."""
+
+    def bake_settings(self, scene):
+        return {}
+
+
+def test_classes_from_elsewhere_are_told_apart_by_all_their_settings(keeps_all, tmp_path, caplog):
+    scene, camera = box()
+    folder = kept.BakeFolder(tmp_path)
+    files = {folder.path(Own(paths=paths), scene, camera, CPU, 1) for paths in (1000, 2000)}
+    assert len(files) == 2
+    with caplog.at_level(logging.INFO, "warp_gi"):
+        bake = folder.bake(
+            CACHE, scene, camera, CPU, 1, lambda: Bake("SurfaceCache", "key", {}, {}, {"n": float("nan")})
+        )
+    assert bake is not None and "cannot be kept" in caplog.text

@@ -1,6 +1,8 @@
 """Kernel modules that threads load ahead: which, in what order, who waits, what is said, and forks."""
 
 import logging
+import subprocess
+import sys
 import threading
 from types import SimpleNamespace
 
@@ -188,3 +190,23 @@ def test_the_kernels_that_a_pipeline_foretells_are_those_that_its_frames_launch(
     assert foretold == loaded
     early = {one.module.name for one in kernels_of(pipeline)}
     assert early >= {name for name in foretold if "path_trace" not in name and "apart" not in name}
+
+
+@pytest.mark.parametrize("ends", ["while it loads", "before"])
+def test_a_thread_that_renders_after_the_main_one_ended_is_done_in_the_end(ends):
+    """Nobody loads ahead any more then, and who waits for a module loads it."""
+    script = f"""
+import threading, time
+import warp_gi as gi
+scene, pipeline = gi.builtin_scene("cornell_box"), gi.Pipeline(spp=1)
+camera = scene.cameras["main"].at_resolution(16, 12)
+scheduler = gi.FrameScheduler(scene, camera, pipeline)
+render = gi.render
+def work():
+    {"time.sleep(0.5)" if ends == "before" else "pass"}
+    frame = next(render(scene, camera, pipeline))
+    print("done", frame.numpy("beauty").mean() > 0, flush=True)
+threading.Thread(target=work).start()
+"""
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert "done True" in result.stdout and result.returncode == 0

@@ -94,11 +94,17 @@ def check_writable(folder: Path) -> None:
 def cache_folder(name: str) -> Path:
     """Return where files that can be made again are kept: ``warp_gi/NAME`` in XDG_CACHE_HOME, or in ~/.cache."""
     root = os.environ.get("XDG_CACHE_HOME")
-    return (Path(root) if root else Path.home() / ".cache") / "warp_gi" / name
+    try:
+        cache = user_path(root) if root else Path.home() / ".cache"
+    except RuntimeError:  # a user without a home, as in a container that runs under any number
+        cache = Path(tempfile.gettempdir()) / f"warp_gi-{os.getuid() if hasattr(os, 'getuid') else 'user'}"
+    return cache / "warp_gi" / name
 
 
-def prune(folder: Path, pattern: str, most_bytes: int) -> None:
+def prune(folder: Path, pattern: str, most_bytes: int, spared: Path | None = None) -> None:
     """Remove the files that were not used for longest (modified last), until the rest are below ``most_bytes``.
+
+    ``spared`` is the one just written.
 
     Another process may remove the same files at the same time. Raises OSError for a file that may not be removed.
     """
@@ -106,11 +112,11 @@ def prune(folder: Path, pattern: str, most_bytes: int) -> None:
     for path in folder.glob(pattern):
         with contextlib.suppress(FileNotFoundError):
             stat = path.stat()
-            files.append((stat.st_mtime, stat.st_size, path))
+            files.append((path == spared, stat.st_mtime, stat.st_size, path))
     total = 0
-    for _, size, path in sorted(files, reverse=True):
+    for is_spared, _, size, path in sorted(files, reverse=True):
         total += size
-        if total > most_bytes:
+        if total > most_bytes and not is_spared:
             path.unlink(missing_ok=True)
 
 

@@ -12,6 +12,7 @@ import contextlib
 import hashlib
 import logging
 import os
+import sys
 import time
 from collections.abc import Callable
 from functools import cache
@@ -24,7 +25,7 @@ import warp as wp
 import warp_gi.kernels
 from warp_gi.baking import Bake, load_bake
 from warp_gi.errors import BakeError, one_line
-from warp_gi.files import cache_folder, prune, remove_stale_parts
+from warp_gi.files import cache_folder, prune, remove_stale_parts, user_path
 
 if TYPE_CHECKING:
     from warp_gi.scene.baked import BakedScene
@@ -38,6 +39,8 @@ LEAST_SECONDS = 0.3
 """Seconds that making a bake has to take for it to be kept."""
 VARIABLE = "WARP_GI_BAKES"
 """Environment variable that names another folder than ``warp_gi/bakes`` in the user's cache."""
+DIGITS = 32
+"""Digits of the hash in a file's name."""
 _SUFFIX = ".safetensors"
 _LOG = logging.getLogger("warp_gi")
 
@@ -52,7 +55,7 @@ class BakeFolder:
 
     def __init__(self, folder: str | Path | None = None, most_bytes: int | None = None) -> None:
         named = folder or os.environ.get(VARIABLE)
-        self.folder = Path(named) if named else cache_folder("bakes")
+        self.folder = user_path(named) if named else cache_folder("bakes")
         self.most_bytes = MOST_BYTES if most_bytes is None else most_bytes
 
     def bake(
@@ -95,9 +98,9 @@ class BakeFolder:
             part.bake_identity(scene, camera),
             seed,
             device.name if device.is_cuda else wp.get_cpu_kernel_cache_key(),
-            (code_hash(), wp.__version__, np.__version__),
+            (code_hash(), _own_code(part), wp.__version__, np.__version__),
         )
-        return self.folder / f"{name}-{hashlib.sha256(repr(decides).encode()).hexdigest()[:32]}{_SUFFIX}"
+        return self.folder / f"{name}-{hashlib.sha256(repr(decides).encode()).hexdigest()[:DIGITS]}{_SUFFIX}"
 
     def _read(self, path: Path) -> Bake | None:
         try:
@@ -116,8 +119,8 @@ class BakeFolder:
             remove_stale_parts(path)
             if bake.nbytes <= self.most_bytes:
                 bake.save(path)
-                prune(self.folder, f"*{_SUFFIX}", self.most_bytes)
-        except OSError as error:
+                prune(self.folder, f"?*-{'[0-9a-f]' * DIGITS}{_SUFFIX}", self.most_bytes, path)
+        except (OSError, BakeError, TypeError) as error:  # TypeError: a value that a file does not hold
             _LOG.info("the bake cannot be kept for the next time: %s", one_line(str(error)))
 
 
@@ -135,6 +138,16 @@ def cached_bake(
         return make()
     folder = kept if isinstance(kept, BakeFolder) else BakeFolder(kept)
     return folder.bake(part, scene, camera, device, seed, make)
+
+
+def _own_code(part: Stateful) -> tuple[str, ...]:
+    """Return what decides the bake of a class from elsewhere, which may tell nothing of its settings."""
+    module = sys.modules.get(type(part).__module__)
+    if type(part).__module__.partition(".")[0] == __name__.partition(".")[0]:
+        return ()
+    source = Path(getattr(module, "__file__", None) or "")
+    code = hashlib.sha256(source.read_bytes()).hexdigest() if source.is_file() else ""
+    return code, repr(part)
 
 
 @cache

@@ -97,12 +97,20 @@ def load_ahead(kernels: Iterable[wp.Kernel], load: Callable[[wp.Kernel], None], 
             wp.config.kernel_cache_dir,
         )
     with _lock:
-        for job in _queue:
-            del _jobs[job.name]
-            job.done.release()
+        _give_up()
+        if not threading.main_thread().is_alive():  # its end has been waited for: nobody loads ahead any more
+            return
         _queue[:] = [Job(one, load) for one in fresh if one.module.name not in _jobs]
         _jobs.update({job.name: job for job in _queue})
     _hire(threads)
+
+
+def _give_up() -> None:
+    """Take all out of the queue; who waits for one of them loads it."""
+    for job in _queue:
+        del _jobs[job.name]
+        job.done.release()
+    _queue.clear()
 
 
 def wait_for(module: str) -> None:
@@ -124,7 +132,7 @@ def wait_for(module: str) -> None:
 def _hire(count: int) -> None:
     """Start threads until there are ``count``, but for those that the system refuses."""
     global _threads
-    while True:
+    for _ in range(count):
         with _lock:
             if _threads >= count or not _queue:
                 return
@@ -142,7 +150,9 @@ def _serve() -> None:
     global _threads
     while True:
         with _lock:
-            if not _queue or not threading.main_thread().is_alive():
+            if not threading.main_thread().is_alive():
+                _give_up()
+            if not _queue:
                 _threads -= 1
                 return
             job = _queue.pop(0)

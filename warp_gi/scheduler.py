@@ -249,11 +249,13 @@ class FrameScheduler:
         return frame
 
     def take_samples(self, spp: int, frame_time: float | None = None) -> None:
-        """Take ``spp`` samples a pixel from the next frame on, as they fit into ``frame_time`` seconds.
+        """Take ``spp`` samples a pixel, and no more camera samples, from the next frame on, as fit into ``frame_time``.
 
         Raises OptionError for a number that the pipeline cannot take.
         """
-        self.pipeline, self._frame_time = replace(self.pipeline, spp=spp), frame_time
+        views = self.pipeline.camera_samples
+        views = None if views is None else min(views, spp)
+        self.pipeline, self._frame_time = replace(self.pipeline, spp=spp, camera_samples=views), frame_time
 
     def trial(self, index: int, previous_index: int, spp: int, resolution: tuple[int, int]) -> Frame:
         """Render a frame after the one before it with other samples and pixels, and go on as if it had not been.

@@ -110,10 +110,11 @@ class Stateful:
     def bake_identity(self, scene: Scene | BakedScene, camera: Camera | CameraPath | None = None) -> str:
         """Return what decides a bake's bits beside class, settings, seed and device: a folder keeps bakes by it.
 
-        By default the whole scene, where it is in its file, under its sky of now, and all views of ``camera``. An
-        override leaves out what the bake never reads.
+        By default the whole scene, where it is in its file, under its sky of now, and all views of ``camera``, for
+        which None stands for the scene's own cameras. An override leaves out what the bake never reads.
         """
-        return f"{scene.hash} {scene.offset.tolist()} {views_hash(camera)}"
+        views = [*getattr(scene, "cameras", {}).values()] if camera is None else [camera]
+        return f"{scene.hash} {scene.offset.tolist()} {' '.join(views_hash(one) for one in views)}"
 
     def forecast(
         self, scene: Scene, device: wp.Device, seed: int, camera: Camera | CameraPath, samples: int

@@ -255,7 +255,7 @@ def test_a_picture_as_reference_gives_the_size(tmp_path, capsys):
 BAD = [
     (["--pipelines", "path,dvff"], "unknown pipeline 'dvff'; did you mean 'dvf'?"),
     (["--pipelines", "path,path"], "names one twice"),
-    (["--pipelines", ""], "unknown pipeline ''"),
+    (["--pipelines", ""], "the argument after --pipelines is empty"),
     (["--time", "soon"], "--time 'soon' not understood"),
     (["--time", "0s"], "--time '0s' not understood"),
     (["--spp", "0"], "--spp must be a whole number from 1"),

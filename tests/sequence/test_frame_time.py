@@ -82,8 +82,20 @@ def test_a_resumed_sequence_repeats_the_number(tmp_path, monkeypatch):
     again = list(gi.render(scene, path(), frames=range(3), resume=True, **arguments))
     assert [f.index for f in again] == [0, 1, 2] or [f.index for f in again] == [2]
     np.testing.assert_array_equal(again[-1].numpy("beauty"), whole[-1].numpy("beauty"))
+    larger = path().at_resolution(30, 20)  # another run, which takes nothing of this one
+    assert next(gi.render(scene, larger, frames=range(3), resume=True, **arguments)).metadata["pipeline.spp"] == 7
     other = list(gi.render(scene, path(), frames=range(3), resume=True, **(arguments | {"frame_time": 0.5})))
     assert [f.metadata["pipeline.spp"] for f in other] == [7, 7, 7]
+
+
+def test_camera_samples_are_no_more_than_samples():
+    scheduler = gi.FrameScheduler(
+        gi.builtin_scene("cornell_box"), path(), gi.Pipeline(spp=16, camera_samples=4), seed=3
+    )
+    assert scheduler.trial(1, 0, 1, (12, 8)).settings.camera_samples == 1
+    assert samples_within(scheduler, shots_of(path(), [1], "#.exr"), 0.2) >= 1
+    scheduler.take_samples(7)
+    assert (scheduler.pipeline.spp, scheduler.pipeline.camera_samples) == (7, 4)
 
 
 def test_seconds_are_read_with_their_units():

@@ -10,6 +10,7 @@ import logging
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from warp_gi.errors import OptionError, SceneError
@@ -53,7 +54,7 @@ def take_time(run: SequenceRun, seconds: float, resume: bool = False) -> int:
     """
     seconds = check_seconds(seconds)
     run.bake()
-    known = _samples_of_files(run.shots, seconds) if resume else None
+    known = _samples_of_files(run, seconds) if resume else None
     samples = known or samples_within(run.scheduler, run.shots, seconds)
     run.scheduler.take_samples(samples, seconds)
     return samples
@@ -96,16 +97,17 @@ def _seconds_of(frame: Frame) -> float:
     return sum(seconds for stage, seconds in frame.timings.items() if stage not in ("bake", "compile"))
 
 
-def _samples_of_files(shots: Sequence[Shot], seconds: float) -> int | None:
-    """Return the samples a pixel of the first file that was given ``seconds``; None if there is none."""
-    for shot in shots:
+def _samples_of_files(run: SequenceRun, seconds: float) -> int | None:
+    """Return the samples a pixel of a file that is as this run would write it, but for them; None if there is none."""
+    for shot in run.shots:
         try:
             metadata = read_frame(shot.path).metadata
         except (SceneError, OptionError):  # missing or torn
             continue
         given, samples = metadata.get("frame_time"), int(metadata.get("pipeline.spp", 0))
-        if (
-            given is not None and math.isclose(float(given), seconds, rel_tol=1e-6) and samples >= 1
-        ):  # files have float32
+        if given is None or not math.isclose(float(given), seconds, rel_tol=1e-6) or samples < 1:  # files have float32
+            continue
+        alike = replace(shot, lineage=str(metadata.get("lineage", "")))
+        if run.with_samples(samples, seconds).is_done(alike):
             return samples
     return None

@@ -10,6 +10,7 @@ Lines about what is kept, and why it is not, are logged (logger "warp_gi", level
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import logging
 import time
@@ -236,6 +237,16 @@ class SequenceRun:
             check_target(shot.path)
         if plan.done:
             _LOG.info("%d of %d frames are there already", len(plan.done), len(plan.shots))
+
+    def with_samples(self, spp: int, frame_time: float) -> SequenceRun:
+        """Return the same run with another number of samples a pixel, to ask about files."""
+        scheduler = copy.copy(self.scheduler)
+        scheduler.take_samples(spp, frame_time)
+        return SequenceRun(scheduler, self.shots, self.output)
+
+    def is_done(self, shot: Shot) -> bool:
+        """Return whether the file of a frame is whole, and as this run would write it."""
+        return why_not_whole(shot.path, self._attributes(shot), shot.camera) is None
 
     def render(self, shot: Shot) -> Frame:
         """Render a frame of the plan's ``todo`` and write its file; the time it took is the frame's timing "write"."""
