@@ -57,6 +57,7 @@ class EdgeSettings:
 class Picture:
     beauty: wp.array(dtype=wp.vec3)
     shining: wp.array(dtype=wp.vec3)  # emission, and the sky
+    alpha: wp.array(dtype=wp.float32)  # share of the camera samples that hit
     less: wp.array(dtype=wp.float32)  # share by which the last picture counts less
 
 
@@ -215,6 +216,7 @@ class EdgeSums:
     reflected: wp.vec3
     shining: wp.vec3
     count: wp.float32
+    hits: wp.float32
     differ: wp.bool  # whether one of them shows something else than the pixel did
 
 
@@ -253,6 +255,7 @@ def with_sample(
         r.reflected += wp.cw_mul(s.bsdf.diffuse, known.diffuse) + wp.cw_mul(glossy_scale(specular), known.glossy)
         r.shining += surface_emission(scene, hit.face, hit.u, hit.v, -direction)
         r.count += 1.0
+        r.hits += 1.0
     return r
 
 
@@ -282,6 +285,7 @@ def sample_edges(
     sums.reflected = (picture.beauty[pixel] - picture.shining[pixel]) * own
     sums.shining = picture.shining[pixel] * own
     sums.count = own
+    sums.hits = picture.alpha[pixel] * own
     more = edges.samples - edges.own
     if edge == 1:
         more = wp.max(2 * more / 3, 1)
@@ -291,6 +295,7 @@ def sample_edges(
     if sums.count > 0.0:
         picture.beauty[pixel] = (sums.reflected + sums.shining) / sums.count
         picture.shining[pixel] = sums.shining / sums.count
+        picture.alpha[pixel] = sums.hits / sums.count
     if not sums.differ:
         picture.less[pixel] = wp.max(picture.less[pixel], LESS_HISTORY)
 

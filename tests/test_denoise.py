@@ -815,3 +815,18 @@ def test_files_and_flags(tmp_path):
     again = [gi.read_frame(tmp_path / f"a.{i:04d}.exr") for i in (0, 1)]
     for one, other in zip((first, second), again, strict=True):
         assert np.array_equal(one.numpy("beauty"), other.numpy("beauty"))
+
+
+def test_coverage_is_of_the_samples_that_edges_take():
+    """A card as bright as what it is laid over is not seen, but for what pictures before leave at its outline."""
+    grey = gi.Material("grey", (0.8, 0.8, 0.8), specular=0.0)
+    tilted = quad((-0.6, -0.45, 0), (1.2, 0.3, 0), (-0.3, 1.0, 0), grey, "card")
+    shot = gi.Scene([gi.Node("card", [tilted])], environment=1.0)
+    camera = gi.Camera.look_at((0, 0, 3), (0, 0, 0), hfov=40, resolution=(48, 36))
+    for blend, bound in ((1.0, 1e-3), (0.25, 0.2)):
+        settings = SpatioTemporal(blend=blend)
+        pipeline = gi.Pipeline(spp=1, indirect=None, background=False, denoise=settings)
+        for frame in gi.render(shot, gi.CameraPath.still(camera), pipeline, frames=range(3)):
+            beauty, alpha = frame.numpy("beauty").mean(-1), frame.numpy("alpha")
+        assert 0 < ((alpha > 0) & (alpha < 1)).mean() < 0.2
+        np.testing.assert_allclose(beauty + (1 - alpha) * 0.8, 0.8, atol=bound)
