@@ -7,7 +7,7 @@ the reflectance at normal incidence, so the specular factor is max(Ks) / 0.04, a
 is the colour of a metal where a metal can be: there is no ``map_Kd``, every channel of Ks is above 0.25 and above Kd,
 Kd and Ks add up to 1 or less, and Kd is not coloured beside a grey Ks. ``Ke`` (times ``map_Ke``) is emitted radiance.
 ``map_d``, or ``d``, or 1 - ``Tr``, is coverage, cut at 0.5; ``Tr 1`` without ``d`` is opaque, as its writers mean it.
-``norm`` is a normal map. Both sides emit.
+``norm`` is a normal map. Both sides emit. A colour of one number is grey.
 """
 
 from __future__ import annotations
