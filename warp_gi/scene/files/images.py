@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import io
+import os
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,9 @@ from warp_gi.errors import SceneError, one_line
 
 def missing_file(path: Path, what: str) -> SceneError:
     """Return an error that says ``what`` is a folder, or is missing, and names the nearest file in the folder."""
-    if path.is_dir():
+    if os.path.isdir(path):
         return SceneError(f"{what} {str(path)!r} is a folder; name a file in it")
-    if not path.parent.is_dir():
+    if not os.path.isdir(path.parent):
         return SceneError(f"{what} {str(path)!r} is missing: there is no folder {str(path.parent)!r}")
     near = difflib.get_close_matches(path.name, sorted(p.name for p in path.parent.iterdir()), n=1, cutoff=0.4)
     hint = f"; did you mean {near[0]!r}?" if near else ""
@@ -25,13 +26,13 @@ def missing_file(path: Path, what: str) -> SceneError:
 def find_file(folder: Path, name: str, what: str) -> Path:
     """Return the path of file ``name`` under ``folder``, upper and lower case aside; raises SceneError if missing."""
     path = folder / name.replace("\\", "/")
-    if path.is_file():
+    if os.path.isfile(path):  # False, not an error, for names that are too long
         return path
     found = folder
     for part in Path(name.replace("\\", "/")).parts:
-        alike = [p for p in found.iterdir() if p.name.lower() == part.lower()] if found.is_dir() else []
+        alike = [p for p in found.iterdir() if p.name.lower() == part.lower()] if os.path.isdir(found) else []
         found = found / (part if part == ".." or not alike else alike[0].name)
-    if found.is_file():
+    if os.path.isfile(found):
         return found
     raise missing_file(path, what)
 

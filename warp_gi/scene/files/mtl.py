@@ -7,11 +7,12 @@ the reflectance at normal incidence, so the specular factor is max(Ks) / 0.04, a
 is the colour of a metal where a metal can be: there is no ``map_Kd``, every channel of Ks is above 0.25 and above Kd,
 Kd and Ks add up to 1 or less, and Kd is not coloured beside a grey Ks. ``Ke`` (times ``map_Ke``) is emitted radiance.
 ``map_d``, or ``d``, or 1 - ``Tr``, is coverage, cut at 0.5; ``Tr 1`` without ``d`` is opaque, as its writers mean it.
-``norm`` is a normal map. Both sides emit.
+``norm`` is a normal map. Both sides emit. A colour of one number is grey.
 """
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,8 +21,8 @@ import numpy as np
 
 from warp_gi.errors import SceneError
 from warp_gi.scene.files.images import find_file, read_image
-from warp_gi.scene.files.obj_text import uncommented
 from warp_gi.scene.files.support import Findings
+from warp_gi.scene.files.text import decode, joined, read_bytes, uncommented, without_comment
 from warp_gi.scene.model import Material, Texture
 
 METAL_SPECULAR = 0.25
@@ -36,9 +37,16 @@ MAP_FEATURES = {
     "map_ks": "maps of the specular colour and exponent",
     "map_ns": "maps of the specular colour and exponent",
     "refl": "reflection maps",
-    "map_ps": "sheen, clear coats and anisotropy of MTL",
+    "map_refl": "reflection maps",
+    **dict.fromkeys(("map_ps", "map_pc", "map_pcr", "map_aniso"), "sheen, clear coats and anisotropy of MTL"),
 }
 NUMBER_FEATURES = dict.fromkeys(("ps", "pc", "aniso"), "sheen, clear coats and anisotropy of MTL")
+COLORS = ("kd", "ks", "ke")
+NUMBERS = {*COLORS, *NUMBER_FEATURES, "ns", "d", "tr", "pr", "pm", "illum"}
+MAPS = ("map_kd", "map_d", "map_ke", "map_emissive", "norm", "map_pr", "map_pm")
+"""Maps that are read, in the order in which their scale and offset count."""
+UNSEEN = {"ka", "map_ka", "ni", "sharpness", "map_aat", "pcr", "anisor"}
+"""Statements without a warning: ambient light is computed, and the others change no picture by themselves."""
 GLASS_MODELS = (4, 6, 7, 9)  # values of illum
 ELSEWHERE = re.compile(r"[A-Za-z]:[\\/]|\\\\|/|~")
 
@@ -51,36 +59,41 @@ class MtlMaterial:
     """Folder of its library."""
     numbers: dict[str, list[float]] = field(default_factory=dict)
     maps: dict[str, list[str]] = field(default_factory=dict)
+    unread: list[tuple[str, str]] = field(default_factory=list)
+    """Names of features that are not read, and where they stand."""
+
+    def add(self, words: list[str], where: str) -> None:
+        """Add a statement, ``where`` of which is its place."""
+        key = words[0].lower()
+        if key in MAPS or key in MAP_FEATURES:
+            if len(words) > 1:
+                self.maps[key] = words[1:]
+        elif key in NUMBERS:
+            words = uncommented(words)
+            values = [_number(word) for word in words[1:] if key != "d" or word.lower() != "-halo"]
+            if len(words) > 1 and words[1].lower() in ("spectral", "xyz"):
+                self.unread.append(("spectral and XYZ colours", f"{' '.join(words[:2])}, {where}"))
+            elif not values or not np.isfinite(values).all() or (key in COLORS and len(values) == 2):
+                self.unread.append(("statements of MTL without the numbers they need", f"{' '.join(words)!r}, {where}"))
+            else:
+                self.numbers[key] = values
+        elif key not in UNSEEN and not (key == "tf" and all(_number(word) == 1.0 for word in uncommented(words)[1:])):
+            self.unread.append((f"{words[0]} of MTL", where))
 
 
-def read_text(path: Path) -> str:
-    """Return the text of a file in UTF-8 or, failing that, Latin-1."""
-    data = path.read_bytes()
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return data.decode("latin-1")
-
-
-def read_mtl(path: Path, findings: Findings) -> dict[str, MtlMaterial]:
+def read_mtl(path: Path) -> dict[str, MtlMaterial]:
     """Return the statements of each material of a library, by its name."""
     materials: dict[str, MtlMaterial] = {}
     current = MtlMaterial(path.parent)
-    for line in read_text(path).splitlines():
-        words = uncommented(line.split())
-        if len(words) < 2 or words[0].startswith("#"):
-            continue
-        key = words[0].lower()
-        if key == "newmtl":
+    data, places = joined(read_bytes(path))
+    at = 0
+    for index, line in enumerate(data.split(b"\n"), 1):
+        words = decode(line).split()
+        if words and words[0].lower() == "newmtl":
             current = materials[" ".join(words[1:])] = MtlMaterial(path.parent)
-        elif key.startswith("map_") or key in ("norm", "bump", "disp", "refl"):
-            current.maps[key] = words[1:]
-        else:
-            try:
-                current.numbers[key] = [float(word) for word in words[1:] if key != "d" or word != "-halo"]
-            except ValueError:
-                if words[1] in ("spectral", "xyz"):
-                    findings.add("spectral and XYZ colours", f"{key} {words[1]} in {path.name!r}")
+        elif words and not words[0].startswith("#"):
+            current.add(words, f"line {index + int(np.searchsorted(places, at))} of {path.name!r}")
+        at += len(line) + 1
     return materials
 
 
@@ -99,7 +112,7 @@ class MtlReader:
         What no library has is a plain grey Lambert, or a white one under vertices with colours (``colored``).
         """
         if name not in self._materials:
-            found = self.statements.get(name or "")
+            found = None if name is None else self.statements.get(name)
             if found is not None:
                 self._materials[name] = self._convert(str(name), found)
             else:
@@ -150,6 +163,8 @@ class MtlReader:
     def _note(self, name: str, source: MtlMaterial) -> None:
         """Note statements that are not read in full."""
         what = f"material {name!r}"
+        for feature, where in source.unread:
+            self.findings.add(feature, where)
         for key in source.maps:
             if key in MAP_FEATURES:
                 self.findings.add(MAP_FEATURES[key], what)
@@ -163,8 +178,7 @@ class MtlReader:
 
     def _transform(self, name: str, source: MtlMaterial) -> np.ndarray | None:
         """Return ``-s`` and ``-o`` of the first map as [2, 3]; None for the identity."""
-        read = ("map_kd", "map_d", "map_ke", "map_emissive", "norm", "map_pr", "map_pm")
-        found = [_map_options(source.maps[key])[2] for key in read if key in source.maps]
+        found = [_map_options(source.maps[key])[2] for key in MAPS if key in source.maps]
         if any(not np.array_equal(one, found[0]) for one in found):
             self.findings.add("one scale and offset a map (-s, -o)", f"material {name!r}")
         return found[0] if found and not np.array_equal(found[0], np.eye(2, 3)) else None
@@ -173,8 +187,12 @@ class MtlReader:
         if key not in source.maps:
             return None
         name, wrap, _ = _map_options(source.maps[key])
-        pixels = self._image(name, material, source.folder)
-        return None if pixels is None else self._once(Texture(name, pixels, srgb, (wrap, wrap)), name, wrap, srgb)
+        file = self._find(name, material, source.folder)
+        if file is None:
+            return None
+        if file not in self._images:
+            self._images[file] = read_image(file, self._what(name, material))
+        return self._once(Texture(name, self._images[file], srgb, (wrap, wrap)), file, wrap, srgb)
 
     def _color_and_coverage(self, material: str, source: MtlMaterial) -> Texture | None:
         """Return the base colour texture with coverage in its alpha."""
@@ -206,27 +224,31 @@ class MtlReader:
     def _once(self, texture: Texture, *key: object) -> Texture:
         return self._textures.setdefault(key, texture)
 
-    def _image(self, name: str, material: str, folder: Path) -> np.ndarray | None:
-        """Return the pixels of a map; None, with a warning, for one that was named by a path of another machine."""
-        what = f"{str(self.path)!r}: texture {name!r} of material {material!r}"
-        is_elsewhere = ELSEWHERE.match(name) is not None
-        bare = re.split(r"[\\/]", name)[-1]
-        tries = [(folder, bare)] if is_elsewhere else [(folder, name), (self.path.parent, name), (folder, bare)]
+    def _what(self, name: str, material: str) -> str:
+        return f"{str(self.path)!r}: texture {name!r} of material {material!r}"
+
+    def _find(self, text: str, material: str, folder: Path) -> Path | None:
+        """Return the file of a map, whose name may hold "#" or have a comment behind it.
+
+        None, with a warning, for one that was named by a path of another machine.
+        """
         missing: SceneError | None = None
-        for place, candidate in tries:
-            try:
-                file = find_file(place, candidate, what)
-                break
-            except SceneError as error:
-                missing = missing or error
-        else:
-            if is_elsewhere:
-                self.findings.lost.append(f"{what} is not here: there is no {bare!r} in {str(folder)!r}; plain colour")
-                return None
-            raise missing or SceneError(f"{what} is missing")
-        if file not in self._images:
-            self._images[file] = read_image(file, what)
-        return self._images[file]
+        for name in dict.fromkeys((unquoted(text), unquoted(without_comment(text)))):
+            what, bare = self._what(name, material), re.split(r"[\\/]", name)[-1]
+            tries = [(folder, name), (self.path.parent, name), (folder, bare)]
+            if ELSEWHERE.match(name):
+                if os.path.isfile(name):
+                    return Path(name)
+                tries = [(folder, bare)]
+            for place, candidate in tries:
+                try:
+                    return find_file(place, candidate, what)
+                except SceneError as error:
+                    missing = missing or error
+        if ELSEWHERE.match(name):
+            self.findings.lost.append(f"{what} is not here: there is no {bare!r} in {str(folder)!r}; plain colour")
+            return None
+        raise missing or SceneError(f"{what} is missing")
 
 
 def _is_metal(diffuse: np.ndarray, specular: np.ndarray) -> bool:
@@ -254,7 +276,10 @@ def _color(numbers: dict[str, list[float]], key: str, default: float, highest: f
 
 
 def _map_options(words: list[str]) -> tuple[str, str, np.ndarray]:
-    """Return the file name, the wrap mode, and scale and offset [2, 3] of a map statement, whose options come first."""
+    """Return the file name as it stands, the wrap mode, and scale and offset [2, 3] of a map statement.
+
+    Its options come first.
+    """
     wrap, at, transform = "repeat", 0, np.eye(2, 3)
     while at < len(words) - 1 and words[at].startswith("-"):
         option, at = words[at].lower(), at + 1
@@ -268,12 +293,17 @@ def _map_options(words: list[str]) -> tuple[str, str, np.ndarray]:
         if option in ("-s", "-o") and all(_is_number(value) for value in values):
             for axis, value in enumerate(values[:2]):
                 transform[axis, axis if option == "-s" else 2] = float(value)
-    return unquoted(" ".join(words[at:])), wrap, transform
+    return " ".join(words[at:]), wrap, transform
 
 
 def unquoted(name: str) -> str:
     """Return a file name without the quotes around it."""
     return name[1:-1] if len(name) > 1 and name[0] == name[-1] and name[0] in "\"'" else name
+
+
+def _number(word: str) -> float:
+    """Return a number; a word that is none becomes nan."""
+    return float(word) if _is_number(word) else np.nan
 
 
 def _is_number(word: str) -> bool:

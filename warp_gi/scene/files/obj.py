@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -15,17 +16,19 @@ from warp_gi.scene.files.obj_text import ObjStatements, parse
 from warp_gi.scene.files.parts import SceneParts
 from warp_gi.scene.files.polygons import triangulate
 from warp_gi.scene.files.support import Findings
+from warp_gi.scene.files.text import read_bytes, without_comment
 from warp_gi.scene.model import Mesh, Node
 
 
 def read_obj(path: Path) -> SceneParts:
     """Read an .obj file and the .mtl files it names, one node a material; raises SceneError."""
     findings = Findings()
-    obj = parse(path.read_bytes(), path, findings)
+    obj = parse(read_bytes(path), path, findings)
     statements: dict[str, MtlMaterial] = {}
     for line in dict.fromkeys(obj.libraries):
         for file in _libraries(line, path, findings):
-            statements = {**read_mtl(file, findings), **statements}
+            statements = {**read_mtl(file), **statements}
+    _name_materials(obj, statements)
     unknown = [name for name in obj.materials if name not in statements]
     if unknown and statements:
         findings.lost.append(f"{str(path)!r}: material {unknown[0]!r} is not in its library; plain grey")
@@ -42,17 +45,33 @@ def read_obj(path: Path) -> SceneParts:
     return SceneParts(nodes, findings=findings)
 
 
+def _name_materials(obj: ObjStatements, statements: dict[str, MtlMaterial]) -> None:
+    """Give the materials of faces their names in the libraries: a name may hold "#", or a comment stand behind it."""
+    commented: dict[str, list[str]] = {}
+    for name in statements:
+        if "#" in name.split()[1:]:
+            commented.setdefault(without_comment(name), []).append(name)
+    for short, names in commented.items():
+        if len(names) == 1:
+            statements.setdefault(short, statements[names[0]])
+    named = [name if name in statements else without_comment(name) for name in obj.materials]
+    named = [name if name in statements else whole for name, whole in zip(named, obj.materials, strict=True)]
+    obj.materials = list(dict.fromkeys(named))
+    index_of = np.array([*(obj.materials.index(name) for name in named), -1])
+    obj.face_materials = index_of[obj.face_materials]
+
+
 def _libraries(line: str, path: Path, findings: Findings) -> list[Path]:
     """Return the files that a ``mtllib`` names: one name, blanks and all, or several with blanks between."""
-    whole = unquoted(line)
+    short = without_comment(line)
     found: list[Path] = []
     missing: SceneError | None = None
-    for names in ([whole], line.split()):
+    for names in ([unquoted(line)], line.split(), [unquoted(short)], short.split()):
         found, missing = [], None
         for name in names:
             bare = re.split(r"[\\/]", name)[-1]
             try:
-                place = bare if ELSEWHERE.match(name) else name
+                place = bare if ELSEWHERE.match(name) and not os.path.isfile(name) else name
                 found.append(find_file(path.parent, place, f"{str(path)!r}: material library"))
             except SceneError as error:
                 missing = missing or error

@@ -14,10 +14,13 @@ import numpy as np
 
 from warp_gi.errors import SceneError
 from warp_gi.scene.files.support import Findings
+from warp_gi.scene.files.text import decode, joined
 
 NEWLINE, SLASH, SPACE, HASH = 10, 47, 32, 35  # all up to the space is blank
 VERTEX, COORDINATE, NORMAL, FACE = range(4)
 KEYWORDS = {b"v": VERTEX, b"vt": COORDINATE, b"vn": NORMAL, b"f": FACE, b"fo": FACE}
+CORNER = re.compile(r"[-+]?\d+(/([-+]?\d+)?){0,2}")
+NOT_ROUNDING = 1.001  # colours above this are no rounded ones
 CURVES = {"vp", "cstype", "deg", "bmat", "step", "curv", "curv2", "surf", "parm", "trim", "hole", "scrv", "sp", "end"}
 
 
@@ -51,13 +54,12 @@ class _Lines:
     """The lines of a text: where each begins and ends, what kind it is."""
 
     def __init__(self, data: bytes) -> None:
-        if b"\r" in data:
-            data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-        if b"\\" in data:
-            data = re.sub(rb"\\[ \t]*\n", b" ", data)  # a line that goes on
+        data, places = joined(data)
         self.bytes = np.frombuffer(data + b"\n", np.uint8).copy()
         self.ends = np.flatnonzero(self.bytes == NEWLINE)
         self.starts = np.concatenate([[0], self.ends[:-1] + 1])
+        self.numbers = np.arange(1, len(self.starts) + 1) + np.searchsorted(places, self.starts)
+        """The number of each line in the file."""
         self._classify()
 
     def _classify(self) -> None:
@@ -85,20 +87,16 @@ class _Lines:
             self.bytes[position : self.ends[line]] = SPACE  # a comment behind numbers
 
     def others(self) -> list[tuple[int, list[str]]]:
-        """Return the number and the words of each line that is not of numbers and no comment."""
+        """Return the index and the words of each line that is not of numbers and no comment."""
         chosen = np.flatnonzero((self.first < self.ends) & (self.kinds < 0) & (self.bytes[self.first] != HASH))
         found = []
         for line in chosen.tolist():
-            data = self.bytes[self.first[line] : self.ends[line]].tobytes()
-            try:
-                text = data.decode("utf-8-sig")
-            except UnicodeDecodeError:
-                text = data.decode("latin-1")
+            text = decode(self.bytes[self.first[line] : self.ends[line]].tobytes())
             found.append((line, text.split()))
         return found
 
     def text(self, kind: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the bytes of all lines of a kind, each with its line end, and the numbers of these lines."""
+        """Return the bytes of all lines of a kind, each with its line end, and the indices of these lines."""
         lines = np.flatnonzero(self.kinds == kind)
         if not len(lines):
             return np.empty(0, np.uint8), lines
@@ -111,7 +109,7 @@ class _Lines:
 def parse(data: bytes, path: object, findings: Findings) -> ObjStatements:
     """Return the statements of an OBJ file; raises SceneError, which names the line that is wrong."""
     lines = _Lines(data)
-    points, colors = _vertices(lines, path)
+    points, colors = _vertices(lines, path, findings)
     uvs = _rows(lines, COORDINATE, 2, path, "vt", least=1)
     normals = _rows(lines, NORMAL, 3, path, "vn")
     corners, sizes, face_lines = _faces(lines, path)
@@ -119,7 +117,7 @@ def parse(data: bytes, path: object, findings: Findings) -> ObjStatements:
     _resolve(lines, corners, sizes, face_lines, given, path)
     small = sizes < 3
     if small.any():
-        findings.add("faces of fewer than three corners", f"line {face_lines[small][0] + 1}")
+        findings.add("faces of fewer than three corners", f"line {lines.numbers[face_lines[small][0]]}")
         corners, sizes, face_lines = corners[np.repeat(~small, sizes)], sizes[~small], face_lines[~small]
     result = ObjStatements(points, colors, uvs, normals, corners, sizes, *_assigned(face_lines))
     _others(lines, result, face_lines, findings)
@@ -135,50 +133,47 @@ def _others(lines: _Lines, result: ObjStatements, face_lines: np.ndarray, findin
     index_of: dict[str, int] = {}
     used, smooth = [(-1, -1)], [(-1, False)]
     for line, words in lines.others():
-        keyword = words[0].lower()
+        keyword, where = words[0].lower(), f"line {lines.numbers[line]}"
         if keyword == "mtllib":
-            result.libraries.append(" ".join(uncommented(words[1:])))
+            result.libraries.append(" ".join(words[1:]))
         elif keyword == "usemtl":
-            name = " ".join(uncommented(words[1:]))
+            name = " ".join(words[1:])
             used.append((line, index_of.setdefault(name, len(index_of))))
         elif keyword == "s" and len(words) > 1:
             smooth.append((line, words[1].lower() not in ("0", "off")))
         elif keyword in ("l", "p"):
-            findings.add("points and lines", f"line {line + 1}")
+            findings.add("points and lines", where)
         elif keyword in CURVES:
-            findings.add("free-form curves and surfaces", f"line {line + 1}")
+            findings.add("free-form curves and surfaces", where)
     result.materials = list(index_of)
     for target, rows in ((result.face_materials, used), (result.face_smooth, smooth)):
         at, values = np.array(rows, np.int64).T
         target[:] = values[np.searchsorted(at, face_lines, side="right") - 1]
 
 
-def uncommented(words: list[str]) -> list[str]:
-    """Return the words before a comment."""
-    for index, word in enumerate(words):
-        if word.startswith("#"):
-            return words[:index] or words
-    return words
-
-
-def _numbers(text: np.ndarray, path: object, keyword: str, dtype: type) -> np.ndarray:
-    """Return all numbers of a text."""
+def _numbers(text: np.ndarray, lines: np.ndarray, path: object, keyword: str, dtype: type) -> np.ndarray:
+    """Return all numbers of a text, whose lines have these numbers in the file."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)
         try:
             return np.fromstring(text.tobytes(), dtype, sep=" ")
         except (DeprecationWarning, ValueError):
-            raise SceneError(_wrong_line(text, path, keyword)) from None
+            raise SceneError(_wrong_line(text, lines, path, keyword, dtype)) from None
 
 
-def _wrong_line(text: np.ndarray, path: object, keyword: str) -> str:
+def _wrong_line(text: np.ndarray, lines: np.ndarray, path: object, keyword: str, dtype: type) -> str:
     """Return a message about the first line of a text that does not hold numbers alone."""
-    for line in text.tobytes().decode("latin-1").splitlines():
+    for number, line in zip(lines.tolist(), text.tobytes().decode("latin-1").split("\n"), strict=False):
         for word in line.replace("/", " ").split():
+            kind = "numbers"
             try:
                 float(word)
+                kind = "whole numbers"
+                if dtype is np.int64:
+                    int(word)
             except ValueError:
-                return f"{str(path)!r}: {keyword} {line.strip()[:60]!r} must hold numbers, got {word[:40]!r}"
+                what = f"{str(path)!r}: line {number}: {keyword} {line.strip()[:60]!r}"
+                return f"{what} must hold {kind}, got {word[:40]!r}"
     return f"{str(path)!r}: a line of {keyword} must hold numbers"
 
 
@@ -201,10 +196,10 @@ def _rows(lines: _Lines, kind: int, width: int, path: object, keyword: str, leas
     text, numbers = lines.text(kind)
     if not len(numbers):
         return np.empty((0, width))
-    counts, values = _counts(text), _numbers(text, path, keyword, np.float64)
+    counts, values = _counts(text), _numbers(text, lines.numbers[numbers], path, keyword, np.float64)
     least = width if least is None else least
     if counts.min() < least:
-        line = numbers[np.argmin(counts)] + 1
+        line = lines.numbers[numbers[np.argmin(counts)]]
         raise SceneError(f"{str(path)!r}: line {line}: {keyword} needs {least} numbers, got {counts.min()}")
     if (counts == counts[0]).all() and counts[0] >= width:
         return values.reshape(len(numbers), -1)[:, :width]
@@ -216,14 +211,21 @@ def _rows(lines: _Lines, kind: int, width: int, path: object, keyword: str, leas
     return rows
 
 
-def _vertices(lines: _Lines, path: object) -> tuple[np.ndarray, np.ndarray | None]:
+def _vertices(lines: _Lines, path: object, findings: Findings) -> tuple[np.ndarray, np.ndarray | None]:
     """Return positions and colours: ``v x y z``, with a weight that is not read, or ``v x y z r g b``."""
     text, numbers = lines.text(VERTEX)
     counts = _counts(text) if len(numbers) else np.zeros(1, np.int64)
     if counts.max() < 6:
         return _rows(lines, VERTEX, 3, path, "v"), None
     rows = _rows(lines, VERTEX, 6, path, "v", least=3)
-    return rows[:, :3], np.where(counts[:, None] >= 6, rows[:, 3:], 1.0)
+    has = counts >= 6
+    colors, scale = rows[:, 3:], 1.0
+    most = float(np.nanmax(colors[has], initial=0.0))
+    if most > NOT_ROUNDING:
+        findings.add("colours of vertices above 1")
+        if most > 2.0 or (np.mod(colors[has], 1.0) == 0.0).all():
+            scale = 1.0 / 255.0
+    return rows[:, :3], np.where(has[:, None], colors * scale, 1.0)
 
 
 def _faces(lines: _Lines, path: object) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -235,7 +237,7 @@ def _faces(lines: _Lines, path: object) -> tuple[np.ndarray, np.ndarray, np.ndar
     sizes = np.diff(np.searchsorted(words, np.flatnonzero(text == NEWLINE)), prepend=0)
     text = np.concatenate([np.full(2, SPACE, np.uint8), text])
     slash = text == SLASH
-    values = _numbers(np.where(slash, np.uint8(SPACE), text), path, "f", np.int64)
+    values = _numbers(np.where(slash, np.uint8(SPACE), text), lines.numbers[numbers], path, "f", np.int64)
     separated = (text <= SPACE) | slash
     number_starts = ~separated
     number_starts[1:] &= separated[:-1]
@@ -246,14 +248,24 @@ def _faces(lines: _Lines, path: object) -> tuple[np.ndarray, np.ndarray, np.ndar
     fields = np.where(step > 0, step + before, np.int8(0))
     firsts = step == 0
     if len(values) != len(at) or np.count_nonzero(firsts) != len(words) or (len(fields) and fields.max() > 2):
-        raise SceneError(f"{str(path)!r}: the corners of a face must be like 1, 1/2, 1//3 or 1/2/3")
+        raise SceneError(_wrong_corner(text, lines.numbers[numbers], path))
     if len(values) == 3 * len(words) and (fields.reshape(-1, 3) == (0, 1, 2)).all():
         return values.reshape(-1, 3), sizes, numbers
     if (np.diff(np.flatnonzero(firsts), append=len(at)) > 3).any():
-        raise SceneError(f"{str(path)!r}: the corners of a face must be like 1, 1/2, 1//3 or 1/2/3")
+        raise SceneError(_wrong_corner(text, lines.numbers[numbers], path))
     corners = np.zeros((len(words), 3), np.int64)
     corners[np.cumsum(firsts) - 1, fields] = values
     return corners, sizes, numbers
+
+
+def _wrong_corner(text: np.ndarray, lines: np.ndarray, path: object) -> str:
+    """Return a message about the first corner of a text of faces that is not written like one."""
+    like = "the corners of a face must be like 1, 1/2, 1//3 or 1/2/3"
+    for number, line in zip(lines.tolist(), text.tobytes().decode("latin-1").split("\n"), strict=False):
+        for word in line.split():
+            if not CORNER.fullmatch(word):
+                return f"{str(path)!r}: line {number}: {like}, got {word[:40]!r}"
+    return f"{str(path)!r}: {like}"
 
 
 def _resolve(
@@ -269,7 +281,7 @@ def _resolve(
         wrong = (indices >= given[column]) | ((values < 0) & (indices < 0)) | ((values == 0) & (column == 0))
         if wrong.any():
             corner = int(np.argmax(wrong))
-            line = int(np.repeat(face_lines, sizes)[corner]) + 1
+            line = lines.numbers[np.repeat(face_lines, sizes)[corner]]
             raise SceneError(
                 f"{str(path)!r}: line {line}: a face names {what} {values[corner]}, which is out of range:"
                 f" the file has {given[column]}"

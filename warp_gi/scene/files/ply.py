@@ -6,6 +6,7 @@ begins, are walked one by one.
 
 from __future__ import annotations
 
+import re
 import struct
 import warnings
 from collections.abc import Sequence
@@ -20,6 +21,7 @@ from warp_gi.errors import SceneError
 from warp_gi.scene.files.parts import SceneParts
 from warp_gi.scene.files.polygons import triangulate
 from warp_gi.scene.files.support import Findings
+from warp_gi.scene.files.text import read_bytes
 from warp_gi.scene.model import Material, Mesh, Node
 
 TYPES = {
@@ -36,6 +38,7 @@ BYTE_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": "
 FORMATS = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d"}
 UV_NAMES = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"), ("texture_s", "texture_t"))
 COLOR_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+LINE_END = re.compile(rb"\r\n|\n|\r")
 INDEX_NAMES = ("vertex_indices", "vertex_index")
 
 
@@ -71,7 +74,7 @@ class Element:
 
 def read_ply(path: Path) -> SceneParts:
     """Read a PLY file: one mesh; raises SceneError."""
-    data, findings = path.read_bytes(), Findings()
+    data, findings = read_bytes(path), Findings()
     elements, order, body = _header(data, path)
     _read_body(data, body, elements, order, path)
     by_name = {element.name: element for element in elements}
@@ -90,15 +93,10 @@ def read_ply(path: Path) -> SceneParts:
 
 def _header(data: bytes, path: Path) -> tuple[list[Element], str, int]:
     """Return the elements, the format, and where the body begins."""
-    end = data.find(b"end_header")
-    at = data.find(b"\n", end) + 1
-    if b"\r" in data[end : at or None] and data[end + 10 : end + 11] == b"\r" and data[end + 11 : end + 12] != b"\n":
-        at = end + 11  # lines that end in a carriage return alone
-    if not data.startswith(b"ply") or end < 0:
-        raise SceneError(f"{str(path)!r} cannot be read as PLY: it has no header from 'ply' to 'end_header'")
     elements: list[Element] = []
     order = ""
-    for line in data[:end].decode("latin-1").splitlines()[1:]:
+    lines, at = _header_lines(data, path)
+    for line in lines:
         words = line.split()
         if not words or words[0] in ("comment", "obj_info"):
             continue
@@ -107,6 +105,8 @@ def _header(data: bytes, path: Path) -> tuple[list[Element], str, int]:
                 order = words[1]
             elif words[0] == "element":
                 elements.append(Element(words[1], int(words[2])))
+                if elements[-1].count < 0:
+                    raise ValueError
             elif words[0] == "property" and words[1] == "list":
                 elements[-1].properties.append(Property(words[4], TYPES[words[3]], TYPES[words[2]]))
             elif words[0] == "property":
@@ -119,7 +119,24 @@ def _header(data: bytes, path: Path) -> tuple[list[Element], str, int]:
         raise SceneError(
             f"{str(path)!r} cannot be read as PLY: its format must be {', '.join(BYTE_ORDERS)}, got {order!r}"
         )
-    return elements, order, at or len(data)
+    return elements, order, at
+
+
+def _header_lines(data: bytes, path: Path) -> tuple[list[str], int]:
+    """Return the lines between the first one and ``end_header``, and where the body begins."""
+    lines: list[bytes] = []
+    at, first = 0, LINE_END.search(data)
+    if data.startswith(b"ply") and first is not None and b"end_header" in data:
+        for match in LINE_END.finditer(data):
+            line, at = data[at : match.start()], match.end()
+            if line.strip() == b"end_header":
+                # after a carriage return alone, a line feed is the first byte of the body
+                at = match.start() + 1 if first[0] == b"\r" else at
+                return [one.decode("latin-1") for one in lines[1:]], at
+            lines.append(line)
+        if data[at:].strip() == b"end_header":
+            return [one.decode("latin-1") for one in lines[1:]], len(data)
+    raise SceneError(f"{str(path)!r} cannot be read as PLY: it has no header from 'ply' to 'end_header'")
 
 
 def _read_body(data: bytes, body: int, elements: list[Element], order: str, path: Path) -> None:
@@ -133,6 +150,12 @@ def _read_body(data: bytes, body: int, elements: list[Element], order: str, path
                 raise SceneError(f"{str(path)!r} cannot be read as PLY: its rows must hold numbers alone") from None
     for element in elements:
         body = _Rows(data, body, element, BYTE_ORDERS[order], order == "ascii", path).read()
+    if order == "ascii" and body != len(data):
+        more = (len(data) - body) // 8
+        raise SceneError(
+            f"{str(path)!r} cannot be read as PLY: its rows hold {more:,} numbers more than its header names;"
+            " export it again"
+        )
 
 
 class _Rows:
@@ -151,6 +174,10 @@ class _Rows:
             f"{str(self.path)!r} is truncated: its {count} rows of {name!r} are not all there; copy it again"
         )
 
+    def _left(self, at: int | None = None) -> int:
+        """Return the number of bytes from a place, or from the begin of the element, to the end."""
+        return len(self.data) - (self.at if at is None else at)
+
     def read(self) -> int:
         """Fill the element's values; return where the next one begins."""
         element = self.element
@@ -161,6 +188,8 @@ class _Rows:
                     element.sizes[one.name] = np.empty(0, np.int64)
             return self.at
         lists = [one for one in element.properties if one.count is not None]
+        if element.count * sum(self._type(one.count or one.kind).itemsize for one in element.properties) > self._left():
+            raise self._short()  # before there is memory for its rows
         return self._uniform({one.name: self._first_size(one) for one in lists}) or self._walk()
 
     def _first_size(self, wanted: Property) -> int:
@@ -171,6 +200,8 @@ class _Rows:
             if one.count is not None:
                 size = self._number(one.count, at)
                 at += self._type(one.count).itemsize
+            if size * self._type(one.kind).itemsize > self._left(at):
+                raise self._short()
             if one is wanted:
                 return size
             at += size * self._type(one.kind).itemsize
@@ -180,12 +211,12 @@ class _Rows:
         """Return one whole number."""
         form = "<d" if self.is_ascii else self.order + FORMATS[kind]
         try:
-            number = int(struct.unpack_from(form, self.data, at)[0])
-        except (struct.error, ValueError, OverflowError):
+            value = struct.unpack_from(form, self.data, at)[0]
+        except struct.error:
             raise self._short() from None
-        if number < 0:
-            raise SceneError(f"{str(self.path)!r} cannot be read as PLY: a list has {number} values")
-        return number
+        if value < 0 or value % 1 != 0:
+            raise SceneError(f"{str(self.path)!r} cannot be read as PLY: a list has {value:g} values")
+        return int(value)
 
     def _uniform(self, sizes: dict[str, int]) -> int | None:
         """Read rows whose lists are all as long as those of the first row; None if there are others."""
@@ -234,6 +265,8 @@ class _Rows:
                 else:
                     length = self._number(count, at)
                 at += width or 0
+                if length * size > self._left(at):
+                    raise self._short()
                 starts[index, row], sizes[index, row] = at, length
                 at += length * size
         if at > len(self.data):
@@ -252,6 +285,8 @@ class _Rows:
 def _mesh(
     vertices: Element, points: np.ndarray, indices: np.ndarray, sizes: np.ndarray, path: Path, findings: Findings
 ) -> Mesh:
+    if indices.dtype.kind == "f" and not (whole := np.isfinite(indices) & (np.trunc(indices) == indices)).all():
+        raise SceneError(f"{str(path)!r}: vertices of faces must be whole numbers, got {indices[~whole][0]:g}")
     corners = indices.astype(np.int64)
     if len(corners) and not (corners.min() >= 0 and corners.max() < len(points)):
         wrong = corners[(corners < 0) | (corners >= len(points))][0]
@@ -284,15 +319,20 @@ def _colors(vertices: Element, findings: Findings) -> np.ndarray | None:
         colors = vertices.columns(names)
         if colors is None or not len(colors):
             continue
-        kind = vertices.kind(names[0])
-        values, most = colors.astype(np.float64), float(np.nanmax(colors))
-        largest = 1.0 if kind[0] == "f" else float(np.iinfo(kind).max)
-        if most <= 255.0 and (kind in ("i2", "i4", "u4") or (kind[0] == "f" and most > 1.0)):
-            largest = 255.0
-        if "alpha" in vertices.values and (vertices.values["alpha"] < vertices.values["alpha"].max()).any():
+        values = colors.astype(np.float64) / _largest(colors, vertices.kind(names[0]))
+        coverage = vertices.values.get("alpha")
+        if coverage is not None and (coverage < _largest(coverage, vertices.kind("alpha"))).any():
             findings.add("alpha of vertex colours")
-        return decode_srgb(np.clip(np.nan_to_num(values / largest), 0.0, 1.0)).astype(np.float32)
+        return decode_srgb(np.clip(np.nan_to_num(values), 0.0, 1.0)).astype(np.float32)
     return None
+
+
+def _largest(values: np.ndarray, kind: str) -> float:
+    """Return the number in a file that stands for 1."""
+    most = float(np.nanmax(values))
+    if most <= 255.0 and (kind in ("i2", "i4", "u4") or (kind[0] == "f" and most > 1.0)):
+        return 255.0
+    return 1.0 if kind[0] == "f" else float(np.iinfo(kind).max)
 
 
 def _note(elements: list[Element], header: bytes, findings: Findings) -> None:
