@@ -195,6 +195,19 @@ def test_scale_and_animation(tmp_path):
     assert np.allclose(box[0], (stair()[0] + UTM + 1).min(axis=0), atol=1e-3)
 
 
+@pytest.mark.parametrize("place", [np.eye(4), np.diag([0.5, 0.5, 0.5, 1.0])])
+def test_keyframes_of_meshes_far_from_their_own_origin(place):
+    """A key as the placement at rest leaves a mesh where it is, whether its points or its node were moved."""
+    world = trimesh.Scene()
+    world.add_geometry(trimesh_of(None, UTM).to_mesh(), node_name="stair", transform=place)
+    scene = gi.load_scene(world, recentre=True)
+    rest = scene.bounds
+    size = (float(place[0, 0]),) * 3
+    scene.animate("stair", [gi.Keyframe(0.0, scale=size), gi.Keyframe(1.0, (3.0, 0.0, 0.0), scale=size)])
+    np.testing.assert_allclose(scene.node_box(0, 0.0), rest, atol=1e-5)
+    np.testing.assert_allclose(scene.node_box(0, 0.5), np.add(rest, (1.5, 0, 0)), atol=1e-5)
+
+
 def test_far_from_everything_but_the_middle_is_where_triangles_are(tmp_path):
     """One stray triangle at the origin does not keep a scene of many far away."""
     file = write_obj(tmp_path / "utm.obj", UTM)

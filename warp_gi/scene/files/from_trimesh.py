@@ -38,8 +38,7 @@ def trimesh_parts(value: Any) -> SceneParts:
         matrix, key = value.graph.get(name)
         geometry = value.geometry[key]
         if hasattr(geometry, "faces"):
-            mesh, placement = reader.placed(reader.mesh(geometry, str(key)), np.array(matrix, np.float64))
-            nodes.append(Node(str(name), [mesh], placement))
+            nodes.append(reader.placed(str(name), reader.mesh(geometry, str(key)), np.array(matrix, np.float64)))
         else:
             reader.findings.add("points and lines", f"geometry {key!r}")
     return SceneParts(nodes, findings=reader.findings)
@@ -60,13 +59,13 @@ class _Reader:
             self._meshes[id(source)] = self._read(source, name)
         return self._meshes[id(source)]
 
-    def placed(self, mesh: Mesh, placement: np.ndarray) -> tuple[Mesh, np.ndarray]:
-        """Return a mesh and its placement so that points keep their digits when they become float32.
+    def placed(self, name: str, mesh: Mesh, placement: np.ndarray) -> Node:
+        """Return the node of a mesh, so that points keep their digits when they become float32.
 
         Of one that lies far from its own origin under a transform, the middle goes into the placement.
         """
         if np.array_equal(placement, np.eye(4)) or not len(mesh.points) or not np.isfinite(mesh.points).all():
-            return mesh, placement
+            return Node(name, [mesh], placement)
         if id(mesh) not in self._near:
             low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
             middle = np.round((low + high) / 2)
@@ -76,7 +75,8 @@ class _Reader:
         near, middle = self._near[id(mesh)]
         shift = np.eye(4)
         shift[:3, 3] = middle
-        return near, placement @ shift
+        x, y, z = middle.tolist()
+        return Node(name, [near], placement @ shift, pivot=(x, y, z))
 
     def _read(self, source: Any, name: str) -> Mesh:
         visual = source.visual

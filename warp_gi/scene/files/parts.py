@@ -80,7 +80,9 @@ class SceneParts:
                 node.keyframes is None and index not in parents and np.array_equal(node.parent_from_node, np.eye(4))
             )
             if is_bare:  # its points may be doubles: they are moved before the cast
-                return replace(node, meshes=[replace(mesh, points=mesh.points - offset) for mesh in node.meshes])
+                x, y, z = (offset + node.pivot).tolist()
+                moved = [replace(mesh, points=mesh.points - offset) for mesh in node.meshes]
+                return replace(node, meshes=moved, pivot=(x, y, z))
             keys = moved_keyframes(node.keyframes or (), -offset)
             return replace(node, parent_from_node=back @ node.parent_from_node, keyframes=keys or None)
 
