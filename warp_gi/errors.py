@@ -54,3 +54,9 @@ def check_whole(name: str, value: object, least: int, most: int) -> None:
     """Raise OptionError unless a setting is a whole number in a range."""
     if isinstance(value, bool) or not isinstance(value, Integral) or not least <= int(value) <= most:
         raise OptionError(f"{name} must be a whole number from {least} to {most}, got {value!r}")
+
+
+def check_number(name: str, value: object) -> None:
+    """Raise OptionError unless a setting is a number."""
+    if isinstance(value, str | bytes) or not hasattr(value, "__float__"):
+        raise OptionError(f"{name} must be a number, got {value!r:.80}")

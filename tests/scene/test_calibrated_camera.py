@@ -238,3 +238,73 @@ def test_the_command_line(tmp_path, capsys):
     file = write(tmp_path / "transforms.json", NERF)
     assert cli.main([*command, "--camera", str(file), "--frames=1"]) == 0
     assert np.allclose(gi.read_frame(tmp_path / "a.exr").camera.intrinsics, K, rtol=1e-5)
+
+
+SQUARE = {"eye": [0, 1, 3], "target": [0, 1, 0]}
+
+
+@pytest.mark.parametrize(
+    "document, words",
+    [
+        ({"keyframes": [SQUARE | {"K": K.tolist()}]}, "keyframe 0 has K and the path no resolution; give resolution"),
+        (
+            {name: value for name, value in NERF.items() if name not in ("w", "h")},
+            "frame 0 has fl_x without w and h; give w and h",
+        ),
+        ({name: value for name, value in NERF.items() if name != "h"}, "frame 0 has fl_x without h"),
+        (
+            {"camera_angle_x": 0, "frames": NERF["frames"]},
+            "camera_angle_x of frame 0 must be an angle in radians between 0 and pi, got 0",
+        ),
+        (
+            {"camera_angle_x": 1, "camera_angle_y": 4, "w": 4, "h": 4, "frames": NERF["frames"]},
+            "camera_angle_y of frame 0 must be an angle",
+        ),
+        ([1, 2], r"expected an object with keyframes or frames, got \[1, 2\]"),
+        ({"keyframes": [[1]]}, r"keyframes of the path must be a list of objects, got \[\[1\]\]"),
+        ({"keyframes": 5}, "keyframes of the path must be a list of objects, got 5"),
+        ({"frames": [7]}, "frames of the file must be a list of objects"),
+        ({"keyframes": [SQUARE], "resolution": 5}, "resolution of the path must be width and height in pixels, got 5"),
+        ({"keyframes": [SQUARE], "resolution": [5]}, "resolution of the path must be width and height"),
+        ({"keyframes": [SQUARE], "resolution": [5, "a"]}, "height of the resolution must be a whole number"),
+        ({"keyframes": [SQUARE | {"eye": [1, 2]}]}, r"eye of keyframe 0 must be 3 finite numbers, got \[1, 2\]"),
+        ({"keyframes": [SQUARE | {"hfov": "wide"}]}, "hfov of keyframe 0 must be a finite number, got 'wide'"),
+        ({"keyframes": [SQUARE | {"lens_shift": 1}]}, "lens_shift of keyframe 0 must be 2 finite numbers, got 1"),
+        ({"keyframes": [SQUARE | {"convention": []}]}, r"convention of keyframe 0 must be a text, got \[\]"),
+        ({"keyframes": [{"world_from_camera": [[1], 2]}]}, "world_from_camera of keyframe 0 must be a matrix"),
+        ({"keyframes": [{"eye": [0, 0, 1]}]}, "'target' is missing from keyframe 0"),
+        ({"fps": "fast", "keyframes": [SQUARE]}, "fps of the path must be a finite number, got 'fast'"),
+        ({"fps": 10**400, "keyframes": [SQUARE]}, "fps of the path must be a finite number"),
+        (NERF | {"k1": "none"}, "k1 of frame 0 must be a finite number"),
+    ],
+)
+def test_files_that_cannot_be_used_say_where_in_one_line(tmp_path, document, words):
+    with pytest.raises(SceneError, match=words) as error:
+        CameraPath.load(write(tmp_path / "t.json", document))
+    assert "t.json: " in str(error.value) and "\n" not in str(error.value) and "object has" not in str(error.value)
+
+
+def test_deep_files_and_files_with_a_byte_order_mark(tmp_path):
+    (tmp_path / "deep.json").write_text("[" * 200_000)
+    with pytest.raises(SceneError, match=r"deep.json: not JSON"):
+        CameraPath.load(tmp_path / "deep.json")
+    (tmp_path / "mark.json").write_text(json.dumps(NERF), encoding="utf-8-sig")
+    assert CameraPath.load(tmp_path / "mark.json").frame_count == 2
+
+
+def test_the_scale_of_a_placement_does_not_count():
+    plain = gi.Camera.from_intrinsics(K, placement(), SIZE)
+    for scale in (1e-6, 1e-30, 1e30):
+        scaled = gi.Camera.from_intrinsics(K, placement() @ np.diag([scale, scale, scale, 1.0]), SIZE)
+        np.testing.assert_allclose(scaled.world_from_camera, plain.world_from_camera, atol=1e-12)
+    for axes in (np.diag([1.0, 0.0, 1.0, 1.0]), np.diag([1e9, 1.0, 1.0, 1.0]) @ np.outer([1, 1, 1, 1], [1, 2, 3, 4])):
+        with pytest.raises(OptionError, match="singular"):
+            gi.Camera(axes)
+
+
+@pytest.mark.parametrize("change", [{"hfov": "a"}, {"pixel_aspect": None}, {"lens_shift": 3}, {"lens_shift": ("a", 0)}])
+def test_settings_of_a_camera_have_to_be_numbers(change):
+    with pytest.raises(OptionError, match=f"{next(iter(change))} must be"):
+        gi.Camera(np.eye(4), **change)
+    with pytest.raises(OptionError, match="must be a 4x4 matrix of numbers"):
+        gi.Camera([["a"]])

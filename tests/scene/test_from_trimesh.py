@@ -80,3 +80,45 @@ def test_points_are_named_and_other_things_refused():
         gi.load_scene(7)
     with pytest.raises(gi.SceneError, match="holds no triangles"):
         gi.load_scene(trimesh.Scene())
+
+
+def test_looking_at_normals_does_not_make_a_mesh_smooth():
+    box = trimesh.creation.box()
+    assert np.isfinite(box.vertex_normals).all()
+    assert gi.load_scene(box).nodes[0].meshes[0].normals is None
+    sphere = trimesh.creation.icosphere(subdivisions=1)
+    exact = sphere.vertices / np.linalg.norm(sphere.vertices, axis=1, keepdims=True)
+    given = trimesh.Trimesh(sphere.vertices, sphere.faces, vertex_normals=exact.astype(np.float32), process=False)
+    np.testing.assert_allclose(gi.load_scene(given).nodes[0].meshes[0].normals, exact, atol=1e-6)
+
+
+def test_meshes_far_from_their_own_origin_keep_their_digits():
+    """One under a transform that brings it back, and one that stays far away and is recentred."""
+    place = np.array([446_123.4, 52.1, 5_411_987.6])
+    box = trimesh.creation.box((0.1, 0.2, 0.3))
+    far = trimesh.Trimesh(box.vertices + place, box.faces, process=False)
+    back, half = np.eye(4), np.diag([0.5, 0.5, 0.5, 1.0])
+    back[:3, 3] = -place
+    world = trimesh.Scene()
+    world.add_geometry(far, node_name="near", transform=back)
+    np.testing.assert_allclose(gi.load_scene(world).bounds, box.bounds, atol=1e-6)
+    world = trimesh.Scene()
+    world.add_geometry(far, node_name="a", geom_name="box", transform=half)
+    world.graph.update(frame_to="b", frame_from="a", matrix=np.eye(4), geometry="box")
+    scene = gi.load_scene(world, recentre=True)
+    np.testing.assert_allclose(scene.bounds + scene.offset, (box.bounds + place) / 2, atol=1e-6)
+    assert scene.nodes[0].meshes[0] is scene.nodes[1].meshes[0]
+
+
+@pytest.mark.parametrize("kind", ["vertex_colors", "face_colors"])
+def test_coverage_of_colors_is_a_mask(kind):
+    points, faces = [[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 1, 2]]
+    count = 3 if kind == "vertex_colors" else 1
+    clear = trimesh.Trimesh(points, faces, process=False, **{kind: [[255, 255, 255, 64]] * count})
+    with pytest.warns(gi.UnsupportedWarning, match=r"coverage between 0 and 1 \(colours of 'mesh'\)"):
+        scene = gi.load_scene(clear)
+    assert scene.materials[0].alpha_cutoff == 0.5
+    hit = scene.bvh("cpu").intersect(np.float32([[0.7, 0.2, 1]]), np.float32([[0, 0, -1]]))
+    assert hit.face.numpy()[0] == -1
+    opaque = trimesh.Trimesh(points, faces, process=False, **{kind: [[255, 255, 255, 255]] * count})
+    assert gi.load_scene(opaque).materials[0].alpha_cutoff is None

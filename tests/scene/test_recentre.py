@@ -195,6 +195,19 @@ def test_scale_and_animation(tmp_path):
     assert np.allclose(box[0], (stair()[0] + UTM + 1).min(axis=0), atol=1e-3)
 
 
+@pytest.mark.parametrize("place", [np.eye(4), np.diag([0.5, 0.5, 0.5, 1.0])])
+def test_keyframes_of_meshes_far_from_their_own_origin(place):
+    """A key as the placement at rest leaves a mesh where it is, whether its points or its node were moved."""
+    world = trimesh.Scene()
+    world.add_geometry(trimesh_of(None, UTM).to_mesh(), node_name="stair", transform=place)
+    scene = gi.load_scene(world, recentre=True)
+    rest = scene.bounds
+    size = (float(place[0, 0]),) * 3
+    scene.animate("stair", [gi.Keyframe(0.0, scale=size), gi.Keyframe(1.0, (3.0, 0.0, 0.0), scale=size)])
+    np.testing.assert_allclose(scene.node_box(0, 0.0), rest, atol=1e-5)
+    np.testing.assert_allclose(scene.node_box(0, 0.5), np.add(rest, (1.5, 0, 0)), atol=1e-5)
+
+
 def test_far_from_everything_but_the_middle_is_where_triangles_are(tmp_path):
     """One stray triangle at the origin does not keep a scene of many far away."""
     file = write_obj(tmp_path / "utm.obj", UTM)
@@ -203,8 +216,23 @@ def test_far_from_everything_but_the_middle_is_where_triangles_are(tmp_path):
         file.read_text()
         + f"o stray\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl other\nf {points + 1} {points + 2} {points + 3}\n"
     )
-    scene = gi.load_scene(file, recentre=True)
+    with pytest.warns(UserWarning, match=r"446,12\d x 5\d x 5,411,98\d m large and reaches .* steps of 500 mm"):
+        scene = gi.load_scene(file, recentre=True)
     assert np.abs(scene.offset - UTM).max() < 3
+
+
+def test_a_scene_that_is_far_on_both_sides_of_its_middle(tmp_path):
+    """No offset helps a scene of 200 km, whose middle is its origin: what it reaches is told."""
+    file = tmp_path / "wide.obj"
+    corners = [(-1, 0, -1), (1, 0, -1), (1, 0, 1), (-1, 0, 1)]
+    file.write_text("".join(f"v {1e5 * x} {y} {1e5 * z}\n" for x, y, z in corners) + "f 1 2 3 4\n")
+    line = r"200,000 x 0 x 200,000 m large and reaches 100,000 m from the origin, where float32 has steps of 7.81 mm"
+    with pytest.warns(UserWarning, match=line):
+        assert not gi.load_scene(file).offset.any()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert gi.load_scene(file, scale=0.1).bounds[1, 0] == 1e4
+        gi.load_scene(file, recentre=False)
 
 
 def test_the_command_line(tmp_path, capsys):

@@ -246,3 +246,42 @@ def test_a_layer_of_a_sequence(tmp_path):
 def test_a_colon_in_a_name(tmp_path):
     file = layered(tmp_path / "sky.exr", "").rename(tmp_path / "sky.exr:beauty")
     assert np.array_equal(Environment.load(file).pixels, picture(0))
+
+
+def test_indented_lines_are_those_of_other_pictures(tmp_path):
+    """Programs that combine pictures, as pcomb, keep the headers of those behind a tab."""
+    lines = ["EXPOSURE=2", "COLORCORR=2 2 2", "FORMAT=32-bit_rle_xyze", f"PRIMARIES= {' '.join(map(str, REC_2020))}"]
+    header = "".join(f"{line}\n" for line in ["FORMAT=32-bit_rle_rgbe", "EXPOSURE=4", *(f"\t{one}" for one in lines)])
+    assert np.allclose(Environment.load(radiance(tmp_path / "sky.hdr", EXACT, header)).pixels, EXACT / 4, rtol=1e-6)
+
+
+def test_headers_with_carriage_returns(tmp_path):
+    stored = np.ascontiguousarray(EXACT[::-1, ::-1])
+    file = radiance(tmp_path / "sky.hdr", stored, "EXPOSURE=2\nFORMAT=32-bit_rle_rgbe\n", "+Y 4 -X 8")
+    file.write_bytes(file.read_bytes().replace(b"\n", b"\r\n", 5))
+    assert np.allclose(Environment.load(file).pixels, EXACT / 2)
+
+
+def test_layers_with_a_slash(tmp_path):
+    file = layered(tmp_path / "sky.exr", "key/left", "fill:a.b/c")
+    assert np.array_equal(Environment.load(f"{file}:key/left").pixels, picture(0))
+    assert np.array_equal(Environment.load(f"{file}:fill:a.b/c").pixels, picture(1))
+    file.rename(tmp_path / "sky.0000.exr")
+    assert np.array_equal(SkySequence(f"{tmp_path}/sky.####.exr:key/left")(0.0).pixels, picture(0))
+
+
+def test_channels_of_a_layer_in_any_order(tmp_path):
+    names = ["A", "Z", "B", "R", "G", "U"]
+    pixels = np.random.default_rng(4).uniform(0.1, 2, (HEIGHT, WIDTH, 6)).astype(np.float32)
+    sky = Environment.load(write(tmp_path / "sky.exr", [(spec_of(names), pixels)]))
+    assert np.array_equal(sky.pixels, pixels[..., [3, 4, 2]])
+    sky = Environment.load(write(tmp_path / "sky.tif", [(spec_of("RGB"), picture())]))
+    assert np.array_equal(sky.pixels, picture())
+
+
+def test_a_data_window_that_is_too_large(tmp_path):
+    spec = spec_of("RGB", width=17_000, height=1)
+    spec.x, spec.full_x, spec.full_y, spec.full_width, spec.full_height = 0, 0, 0, WIDTH, HEIGHT
+    file = write(tmp_path / "sky.exr", [(spec, np.zeros((1, 17_000, 3), np.float32))])
+    with pytest.raises(SceneError, match="data window is 17000x1, at most 16384 a side"):
+        Environment.load(file)

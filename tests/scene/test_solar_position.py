@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from datetime import datetime, timedelta, timezone
+from datetime import date, datetime, timedelta, timezone
 
 import numpy as np
 import pytest
@@ -102,6 +102,15 @@ NOON = {"date": datetime(2024, 6, 1, 12, tzinfo=UTC), "latitude": 50.0, "longitu
         ({"longitude": math.nan}, "longitude must be between -180 and 180 degrees, got nan"),
         ({"elevation": 30.0}, "elevation follows from its date; leave one of the two out"),
         ({"date": None}, "go with a date"),
+        ({"date": "2024-06-21"}, r"date must be a datetime.datetime with a time zone, got '2024-06-21'"),
+        (
+            {"date": date(2024, 6, 21)},
+            r"must be a datetime.datetime with a time zone, got datetime.date\(2024, 6, 21\)",
+        ),
+        ({"latitude": "50"}, "latitude must be a number, got '50'"),
+        ({"turbidity": "3"}, "turbidity must be a number, got '3'"),
+        ({"ground_albedo": 0.2}, "ground_albedo must be three numbers"),
+        ({"ground_albedo": ("a", 0, 0)}, "ground_albedo must be three numbers|ground_albedo must be a number"),
         ({"date": datetime(2024, 6, 1, 0, tzinfo=UTC)}, r"sun is 1\d.\d degrees below the horizon.* ends at 6"),
     ],
 )

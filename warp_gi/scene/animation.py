@@ -102,6 +102,10 @@ def turned_quaternion(rotation: np.ndarray, quaternion: ArrayLike) -> tuple[floa
 def set_keyframes(node: Node, keyframes: Sequence[Keyframe], offset: np.ndarray) -> None:
     """Give a node keyframes; of those of a root, which are in a file's coordinates, ``offset`` [3] is taken."""
     node.keyframes = moved_keyframes(keyframes, -offset) if node.parent is None else list(keyframes)
+    if any(node.pivot):  # exact at the keys, and between them unless they turn
+        moved = [pose_matrix(np.zeros(3), key.rotation, key.scale)[:3, :3] @ node.pivot for key in keyframes]
+        pairs = zip(node.keyframes, moved, strict=True)
+        node.keyframes = [moved_keyframes([key], np.asarray(move))[0] for key, move in pairs]
 
 
 def world_matrices(nodes: Sequence[Node], time: float) -> list[np.ndarray]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,6 +22,8 @@ PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 """Camera models of COLMAP that are pinholes, once the distortion is left out."""
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 RESOLUTION = (960, 540)
+LARGEST = 1e300
+"""Magnitude above which a number of a file is a mistake."""
 
 
 @dataclass
@@ -41,12 +43,14 @@ class CameraFile:
 def read_camera_file(path: Path) -> CameraFile:
     """Return the cameras of a JSON file, see ``CameraPath.load``; raises SceneError."""
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise SceneError(f"camera path {path}: {error.strerror}; give a JSON file with keyframes") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise SceneError(f"camera path {path}: not JSON ({error})") from error
-    if isinstance(document, dict) and "frames" in document and "keyframes" not in document:
+    if not isinstance(document, dict):
+        raise SceneError(f"camera path {path}: expected an object with keyframes or frames, got {_shown(document)}")
+    if "frames" in document and "keyframes" not in document:
         return naming_file(path, lambda: _transforms(document, path))
     return naming_file(path, lambda: _keyframes(document))
 
@@ -55,49 +59,119 @@ def naming_file(path: Path, read: Callable[[], T]) -> T:
     """Return what ``read`` does; its errors name the file."""
     try:
         return read()
-    except KeyError as error:
-        raise SceneError(f"camera path {path}: {error} is missing from the path or from a keyframe") from error
     except SceneError:
         raise
-    except (TypeError, ValueError, AttributeError) as error:
+    except ValueError as error:
         raise SceneError(f"camera path {path}: {error}") from error
 
 
+class _Fields:
+    """Fields of an object in the file. Raises ValueError that names the object and the field."""
+
+    def __init__(self, values: Mapping[str, Any], what: str) -> None:
+        self.values, self.what = values, what
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.values
+
+    def expected(self, name: str, kind: str) -> ValueError:
+        """Return an error about a field."""
+        if name not in self.values:
+            return ValueError(f"{name!r} is missing from {self.what}; expected {kind}")
+        return ValueError(f"{name} of {self.what} must be {kind}, got {_shown(self.values[name])}")
+
+    def number(self, name: str, default: float | None = None) -> float:
+        """Return a finite number; None as the default says that it must be there."""
+        value = self.values.get(name, default)
+        if not _is_number(value):
+            raise self.expected(name, "a finite number")
+        return float(value)
+
+    def numbers(self, name: str, count: int, default: Sequence[float] | None = None) -> tuple[float, ...]:
+        """Return a list of finite numbers."""
+        values = self.values.get(name, default)
+        if not isinstance(values, list | tuple) or len(values) != count or not all(map(_is_number, values)):
+            raise self.expected(name, f"{count} finite numbers")
+        return tuple(map(float, values))
+
+    def size(self, name: str, default: int | None = None) -> int:
+        """Return a whole number of pixels from 1 up; some writers have 960.0."""
+        value = self.values.get(name, default)
+        if not _is_number(value) or value != int(value) or value < 1:
+            raise self.expected(name, "a whole number from 1 up")
+        return int(value)
+
+    def matrix(self, name: str) -> list[list[float]]:
+        """Return rows of numbers, all of one length."""
+        rows: Any = self.values.get(name)
+        is_matrix = isinstance(rows, list) and all(isinstance(row, list) for row in rows)
+        if not is_matrix or len({len(row) for row in rows}) != 1 or not all(_is_number(x) for row in rows for x in row):
+            raise self.expected(name, "a matrix of finite numbers, a list of rows")
+        return rows
+
+    def text(self, name: str, default: str) -> str:
+        """Return a text."""
+        value = self.values.get(name, default)
+        if not isinstance(value, str):
+            raise self.expected(name, "a text")
+        return value
+
+    def objects(self, name: str, singular: str) -> list[_Fields]:
+        """Return the fields of each object of a list."""
+        values = self.values.get(name)
+        if not isinstance(values, list) or not all(isinstance(one, dict) for one in values):
+            raise self.expected(name, "a list of objects")
+        return [_Fields(one, f"{singular} {number}") for number, one in enumerate(values)]
+
+
 def _keyframes(document: Mapping[str, Any]) -> CameraFile:
-    width, height = (int(size) for size in document.get("resolution", RESOLUTION))
-    cameras = [_camera(key, (width, height)) for key in document["keyframes"]]
-    times = [float(key.get("time", 0.0)) for key in document["keyframes"]]
-    fps = float(document.get("fps", 24.0))
-    return CameraFile(cameras, times, fps, [_look(key) if "eye" in key else None for key in document["keyframes"]])
+    path = _Fields(document, "the path")
+    if "resolution" in path and not isinstance(document["resolution"], list):
+        raise path.expected("resolution", "width and height in pixels")
+    sides = document.get("resolution", RESOLUTION)
+    if len(sides) != 2:
+        raise path.expected("resolution", "width and height in pixels")
+    both = _Fields({"width": sides[0], "height": sides[1]}, "the resolution")
+    size = both.size("width"), both.size("height")
+    keys = path.objects("keyframes", "keyframe")
+    for key in keys:
+        if "K" in key and "resolution" not in path:
+            raise ValueError(
+                f"{key.what} has K and the path no resolution; give resolution, the width and height in pixels of K"
+            )
+    cameras = [_camera(key, size) for key in keys]
+    times = [key.number("time", 0.0) for key in keys]
+    return CameraFile(cameras, times, path.number("fps", 24.0), [_look(key) if "eye" in key else None for key in keys])
 
 
-def _camera(key: Mapping[str, Any], resolution: tuple[int, int]) -> Camera:
+def _camera(key: _Fields, resolution: tuple[int, int]) -> Camera:
     """Return the camera of a keyframe."""
-    convention = key.get("convention", "opengl")
+    convention: Any = key.text("convention", "opengl")
     if "K" in key:
+        K = key.matrix("K")
         if "world_from_camera" in key:
-            return Camera.from_intrinsics(key["K"], key["world_from_camera"], resolution, convention)
-        return Camera.from_intrinsics(key["K"], Camera.look_at(*_look(key)).world_from_camera, resolution, "opengl")
+            return Camera.from_intrinsics(K, key.matrix("world_from_camera"), resolution, convention)
+        return Camera.from_intrinsics(K, Camera.look_at(*_look(key)).world_from_camera, resolution, "opengl")
     if "world_from_camera" in key:
-        camera = Camera.from_intrinsics(np.eye(3), key["world_from_camera"], (1, 1), convention)
+        camera = Camera.from_intrinsics(np.eye(3), key.matrix("world_from_camera"), (1, 1), convention)
     else:
         camera = Camera.look_at(*_look(key))
-    right, above = (float(shift) for shift in key.get("lens_shift", (0.0, 0.0)))
+    right, above = key.numbers("lens_shift", 2, (0.0, 0.0))
     camera = replace(
         camera,
-        hfov=float(key.get("hfov", 65.0)),
+        hfov=key.number("hfov", 65.0),
         resolution=resolution,
         lens_shift=(right, above),
-        pixel_aspect=float(key.get("pixel_aspect", 1.0)),
+        pixel_aspect=key.number("pixel_aspect", 1.0),
     )
     if "vfov" in key and "hfov" in key:
-        raise ValueError("a keyframe has both hfov and vfov; leave one out")
-    return camera.with_vfov(float(key["vfov"])) if "vfov" in key else camera
+        raise ValueError(f"{key.what} has both hfov and vfov; leave one out")
+    return camera.with_vfov(key.number("vfov")) if "vfov" in key else camera
 
 
-def _look(key: Mapping[str, Any]) -> tuple[Vec3, Vec3, Vec3]:
+def _look(key: _Fields) -> tuple[Vec3, Vec3, Vec3]:
     """Return eye, target and up of a keyframe."""
-    return _three(key["eye"]), _three(key["target"]), _three(key.get("up", (0, 1, 0)))
+    return _three(key.numbers("eye", 3)), _three(key.numbers("target", 3)), _three(key.numbers("up", 3, (0, 1, 0)))
 
 
 def _transforms(document: Mapping[str, Any], path: Path) -> CameraFile:
@@ -105,18 +179,19 @@ def _transforms(document: Mapping[str, Any], path: Path) -> CameraFile:
     cameras: list[Camera] = []
     sizes: list[tuple[int, int]] = []
     distorted: set[str] = set()
-    if not document["frames"]:
+    frames = _Fields(document, "the file").objects("frames", "frame")
+    if not frames:
         raise ValueError("expected frames, found none")
-    for number, frame in enumerate(document["frames"]):
-        values = {**document, **frame}
-        model = values.get("camera_model", "OPENCV")
-        if model not in PINHOLES or values.get("is_fisheye"):
-            raise ValueError(f"frame {number} has a camera of the model {model}; expected one of {', '.join(PINHOLES)}")
-        distorted |= {name for name in DISTORTION if values.get(name)}
-        sizes.append((int(values.get("w", RESOLUTION[0])), int(values.get("h", RESOLUTION[1]))))
+    for frame in frames:
+        values = _Fields({**document, **frame.values}, frame.what)
+        model = values.text("camera_model", "OPENCV")
+        if model not in PINHOLES or values.values.get("is_fisheye"):
+            raise ValueError(f"{frame.what} has a camera of the model {model}; expected one of {', '.join(PINHOLES)}")
+        distorted |= {name for name in DISTORTION if values.number(name, 0.0)}
+        sizes.append(_size(values))
         if sizes[-1] != sizes[0]:
             (w, h), (width, height) = sizes[-1], sizes[0]
-            raise ValueError(f"frame {number} is {w}x{h}, the first {width}x{height}; make a file for each size")
+            raise ValueError(f"{frame.what} is {w}x{h}, the first {width}x{height}; make a file for each size")
         cameras.append(_transforms_camera(values, sizes[0]))
     if distorted:
         names = ", ".join(sorted(distorted))
@@ -128,21 +203,46 @@ def _transforms(document: Mapping[str, Any], path: Path) -> CameraFile:
     return CameraFile(cameras)
 
 
-def _transforms_camera(values: Mapping[str, Any], resolution: tuple[int, int]) -> Camera:
+def _size(values: _Fields) -> tuple[int, int]:
+    """Return width and height of a frame. What is given in pixels has no meaning without them."""
+    lacking = [side for side in ("w", "h") if side not in values]
+    given = [name for name in ("fl_x", "fl_y", "cx", "cy", "w", "h") if name in values]
+    if lacking and given:
+        raise ValueError(f"{values.what} has {given[0]} without {' and '.join(lacking)}; give w and h in pixels")
+    return values.size("w", RESOLUTION[0]), values.size("h", RESOLUTION[1])
+
+
+def _transforms_camera(values: _Fields, resolution: tuple[int, int]) -> Camera:
     width, height = resolution
     if "fl_x" in values:
-        fx = float(values["fl_x"])
+        fx = values.number("fl_x")
     elif "camera_angle_x" in values:
-        fx = 0.5 * width / math.tan(float(values["camera_angle_x"]) / 2)
+        fx = _focal_length(values, "camera_angle_x", width)
     else:
-        raise KeyError("fl_x or camera_angle_x")
-    fy = float(values.get("fl_y", fx))
+        raise ValueError(f"fl_x or camera_angle_x is missing from {values.what}; give one of them")
+    fy = values.number("fl_y", fx)
     if "fl_y" not in values and "camera_angle_y" in values and "h" in values:
-        fy = 0.5 * height / math.tan(float(values["camera_angle_y"]) / 2)
-    K = [[fx, 0.0, float(values.get("cx", width / 2))], [0.0, fy, float(values.get("cy", height / 2))], [0.0, 0.0, 1.0]]
-    return Camera.from_intrinsics(K, np.array(values["transform_matrix"], np.float64), resolution, "opengl")
+        fy = _focal_length(values, "camera_angle_y", height)
+    K = [[fx, 0.0, values.number("cx", width / 2)], [0.0, fy, values.number("cy", height / 2)], [0.0, 0.0, 1.0]]
+    return Camera.from_intrinsics(K, values.matrix("transform_matrix"), resolution, "opengl")
 
 
-def _three(values: Any) -> Vec3:
-    x, y, z = (float(v) for v in values)
+def _focal_length(values: _Fields, name: str, side: int) -> float:
+    """Return the focal length in pixels of a field of view."""
+    angle = values.number(name)
+    if not 0.0 < angle < math.pi:
+        raise values.expected(name, "an angle in radians between 0 and pi")
+    return 0.5 * side / math.tan(angle / 2)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and -LARGEST <= value <= LARGEST
+
+
+def _shown(value: object) -> str:
+    return f"{value!r:.60}"
+
+
+def _three(values: Sequence[float]) -> Vec3:
+    x, y, z = values
     return x, y, z

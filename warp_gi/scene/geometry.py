@@ -42,6 +42,7 @@ class FlatGeometry:
 
 def check_nodes(nodes: Sequence[Node]) -> None:
     """Raise SceneError for a bad hierarchy, transform, keyframe or mesh, or if there is no triangle at all."""
+    checked: set[int] = set()  # of a mesh that stands in many places once
     for index, node in enumerate(nodes):
         if node.parent is not None and not 0 <= node.parent < index:
             raise SceneError(f"node {node.name!r}: parent must stand before it (0 to {index - 1}), got {node.parent}")
@@ -51,7 +52,9 @@ def check_nodes(nodes: Sequence[Node]) -> None:
         if node.keyframes is not None:
             check_keyframes(node.keyframes, node.name)
         for mesh in node.meshes:
-            check_mesh(mesh, f"mesh {mesh.name!r} of node {node.name!r}")
+            if id(mesh) not in checked:
+                check_mesh(mesh, f"mesh {mesh.name!r} of node {node.name!r}")
+                checked.add(id(mesh))
     if not any(len(mesh.indices) for node in nodes for mesh in node.meshes):
         raise SceneError("the scene has no triangles; give at least one mesh with faces")
 

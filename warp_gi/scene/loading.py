@@ -103,6 +103,7 @@ def _recentred(parts: SceneParts, told: str, scale: float, recentre: bool | None
     farthest = float(np.abs(offset).max()) * scale
     step = float(np.spacing(np.float32(farthest)))
     if recentre is None and not step > LARGEST_STEP:
+        _warn_of_extent(parts, told, scale)
         return parts
     if recentre is None:
         warnings.warn(
@@ -110,7 +111,23 @@ def _recentred(parts: SceneParts, told: str, scale: float, recentre: bool | None
             f" recentred by {offset_text(scale * offset)} m; cameras are still in the file's coordinates",
             stacklevel=3,
         )
-    return parts.recentred(offset)
+    moved = parts.recentred(offset)
+    _warn_of_extent(moved, told, scale)
+    return moved
+
+
+def _warn_of_extent(parts: SceneParts, told: str, scale: float) -> None:
+    """Warn of parts that reach so far from their origin that no offset gives them fine coordinates."""
+    low, high = parts.bounds() * scale
+    farthest = float(max(np.abs(low).max(), np.abs(high).max()))
+    step = float(np.spacing(np.float32(farthest)))
+    if step > LARGEST_STEP:
+        extent = " x ".join(f"{side:,.0f}" for side in high - low)
+        warnings.warn(
+            f"{told!r} is {extent} m large and reaches {farthest:,.0f} m from the origin, where float32 has steps of"
+            f" {1000 * step:.3g} mm; leave out what is far away, or load it in parts",
+            stacklevel=4,
+        )
 
 
 def _file_parts(path: Path) -> SceneParts:

@@ -135,6 +135,9 @@ class Node:
     """Index of the parent in Scene.nodes."""
     keyframes: list[Keyframe] | None = None
     """Animation of the node, which replaces ``parent_from_node``; None rests."""
+    pivot: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Point of the node's own space in a file that is its origin now, because what lies there is far away in the
+    file; keyframes are given for the file's."""
 
 
 @dataclass(frozen=True)

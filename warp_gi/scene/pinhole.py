@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 import warp as wp
 
-from warp_gi.errors import OptionError, unknown_name
+from warp_gi.errors import OptionError, check_number, unknown_name
 from warp_gi.kernels import gbuffer
 
 Vector = Sequence[float] | np.ndarray
@@ -48,9 +48,17 @@ class Camera:
     """Point in metres of a file's coordinates that ``world_from_camera`` counts from: that of a recentred scene."""
 
     def __post_init__(self) -> None:
-        matrix = np.array(self.world_from_camera, dtype=np.float64)
+        try:
+            matrix = np.array(self.world_from_camera, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise OptionError(
+                f"camera {self.name!r}: world_from_camera must be a 4x4 matrix of numbers,"
+                f" got {self.world_from_camera!r:.80}"
+            ) from error
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
             raise OptionError(f"camera {self.name!r}: world_from_camera must be a finite 4x4 matrix, got {matrix}")
+        # whatever the scale of an axis: a power of 2, which changes no digit
+        matrix[:3, :3] = np.ldexp(matrix[:3, :3], -np.frexp(np.abs(matrix[:3, :3]).max(axis=0))[1])
         if abs(np.linalg.det(matrix[:3, :3])) < 1e-12:
             raise OptionError(f"camera {self.name!r}: world_from_camera is singular; give three independent axes")
         if np.linalg.det(matrix[:3, :3]) < 0:
@@ -63,11 +71,17 @@ class Camera:
         y /= np.linalg.norm(y)
         matrix[:3, :3] = np.stack([np.cross(y, z), y, z], axis=1)
         object.__setattr__(self, "world_from_camera", matrix)
+        check_number(f"camera {self.name!r}: hfov", self.hfov)
+        check_number(f"camera {self.name!r}: pixel_aspect", self.pixel_aspect)
         if not 0.0 < self.hfov < 180.0:
             raise OptionError(f"camera {self.name!r}: hfov must be between 0 and 180 degrees, got {self.hfov}")
         if not (self.pixel_aspect > 0 and math.isfinite(self.pixel_aspect)):
             raise OptionError(f"camera {self.name!r}: pixel_aspect must be finite and above 0, got {self.pixel_aspect}")
-        if len(self.lens_shift) != 2 or not all(math.isfinite(shift) for shift in self.lens_shift):
+        if np.shape(self.lens_shift) != (2,):
+            raise OptionError(f"camera {self.name!r}: lens_shift must be two finite numbers, got {self.lens_shift!r}")
+        for shift in self.lens_shift:
+            check_number(f"camera {self.name!r}: lens_shift", shift)
+        if not all(math.isfinite(shift) for shift in self.lens_shift):
             raise OptionError(f"camera {self.name!r}: lens_shift must be two finite numbers, got {self.lens_shift}")
         try:
             width, height = (int(size) for size in self.resolution)

@@ -14,7 +14,7 @@ from datetime import datetime
 import numpy as np
 
 from warp_gi.color import RGB_FROM_XYZ
-from warp_gi.errors import OptionError
+from warp_gi.errors import OptionError, check_number
 from warp_gi.scene.model import Color
 from warp_gi.scene.solar_position import sun_position
 
@@ -107,9 +107,14 @@ class SunSky:
             ("height", 16, 4096),
         ):
             value = getattr(self, name)
+            check_number(f"SunSky {name}", value)
             if not (low <= value <= high and math.isfinite(value)):
                 raise OptionError(f"SunSky {name} must be between {low} and {high}, got {value}")
-        if len(self.ground_albedo) != 3 or not all(0 <= a <= 1 for a in self.ground_albedo):
+        if np.shape(self.ground_albedo) != (3,):
+            raise OptionError(f"SunSky ground_albedo must be three numbers between 0 and 1, got {self.ground_albedo!r}")
+        for albedo in self.ground_albedo:
+            check_number("SunSky ground_albedo", albedo)
+        if not all(0 <= a <= 1 for a in self.ground_albedo):
             raise OptionError(f"SunSky ground_albedo must be three numbers between 0 and 1, got {self.ground_albedo}")
 
     def _follow_date(self) -> None:
@@ -118,6 +123,11 @@ class SunSky:
             if self.latitude is not None or self.longitude is not None or self.north:
                 raise OptionError("SunSky latitude, longitude and north go with a date; give date too")
             return
+        if not isinstance(self.date, datetime):
+            raise OptionError(
+                f"SunSky date must be a datetime.datetime with a time zone, got {self.date!r:.80}; for example"
+                " datetime(2024, 6, 21, 12, tzinfo=timezone.utc)"
+            )
         if self.date.tzinfo is None or self.date.utcoffset() is None:
             raise OptionError(
                 f"SunSky date must have a time zone, got {self.date.isoformat()}; for example"
@@ -127,6 +137,7 @@ class SunSky:
             value = getattr(self, name)
             if value is None:
                 raise OptionError(f"SunSky date needs a place; give {name} in degrees too")
+            check_number(f"SunSky {name}", value)
             if not -most <= value <= most:
                 raise OptionError(f"SunSky {name} must be between {-most:g} and {most:g} degrees, got {value}")
         for name in ("elevation", "azimuth"):

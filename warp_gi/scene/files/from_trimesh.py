@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,9 @@ from warp_gi.errors import SceneError
 from warp_gi.scene.files.parts import SceneParts
 from warp_gi.scene.files.support import Findings
 from warp_gi.scene.model import Material, Mesh, Node, Texture
+
+FAR_STEP, FAR_EXTENTS = 0.001, 2
+"""Step of float32, and distance in sizes of a mesh, from which a mesh is far from its own origin."""
 
 
 def is_trimesh(value: object) -> bool:
@@ -29,13 +33,12 @@ def trimesh_parts(value: Any) -> SceneParts:
         return SceneParts([Node(_name(value, "mesh"), [reader.mesh(value, "mesh")])], findings=reader.findings)
     if not hasattr(value, "graph") or not hasattr(value, "geometry"):
         raise SceneError(f"expected a trimesh.Trimesh or trimesh.Scene, got a {type(value).__name__}")
-    nodes = []
+    nodes: list[Node] = []
     for name in value.graph.nodes_geometry:
         matrix, key = value.graph.get(name)
         geometry = value.geometry[key]
         if hasattr(geometry, "faces"):
-            placement = np.array(matrix, np.float64)
-            nodes.append(Node(str(name), [reader.mesh(geometry, str(key))], placement))
+            nodes.append(reader.placed(str(name), reader.mesh(geometry, str(key)), np.array(matrix, np.float64)))
         else:
             reader.findings.add("points and lines", f"geometry {key!r}")
     return SceneParts(nodes, findings=reader.findings)
@@ -47,6 +50,7 @@ class _Reader:
     def __init__(self) -> None:
         self.findings = Findings()
         self._meshes: dict[int, Mesh] = {}
+        self._near: dict[int, tuple[Mesh, np.ndarray]] = {}
         self._materials: dict[int, Material] = {}
         self._textures: dict[tuple[int, bool], Texture] = {}
 
@@ -55,12 +59,29 @@ class _Reader:
             self._meshes[id(source)] = self._read(source, name)
         return self._meshes[id(source)]
 
+    def placed(self, name: str, mesh: Mesh, placement: np.ndarray) -> Node:
+        """Return the node of a mesh, so that points keep their digits when they become float32.
+
+        Of one that lies far from its own origin under a transform, the middle goes into the placement.
+        """
+        if np.array_equal(placement, np.eye(4)) or not len(mesh.points) or not np.isfinite(mesh.points).all():
+            return Node(name, [mesh], placement)
+        if id(mesh) not in self._near:
+            low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+            middle = np.round((low + high) / 2)
+            farthest = np.abs([low, high]).max()
+            is_far = np.spacing(np.float32(farthest)) > FAR_STEP and farthest > FAR_EXTENTS * (high - low).max()
+            self._near[id(mesh)] = (replace(mesh, points=mesh.points - middle) if is_far else mesh), middle * is_far
+        near, middle = self._near[id(mesh)]
+        shift = np.eye(4)
+        shift[:3, 3] = middle
+        x, y, z = middle.tolist()
+        return Node(name, [near], placement @ shift, pivot=(x, y, z))
+
     def _read(self, source: Any, name: str) -> Mesh:
         visual = source.visual
         points, indices = np.asarray(source.vertices), np.asarray(source.faces)
-        cache: Any = getattr(source, "_cache", {})  # normals that a file gave lie there; others are computed when asked
-        given = cache["vertex_normals"] if "vertex_normals" in cache else None
-        normals = None if given is None else np.asarray(given, np.float32)
+        normals = _given_normals(source)
         uvs, colors, material = getattr(visual, "uv", None), None, None
         if getattr(visual, "kind", None) == "vertex":
             colors = _linear(visual.vertex_colors)
@@ -70,6 +91,10 @@ class _Reader:
         elif getattr(visual, "material", None) is not None:
             material = self._material(visual.material, name)
         plain = Material(name, (0.8,) * 3 if colors is None else (1.0,) * 3, specular=0.0)
+        if colors is not None and (colors[:, 3] < 1.0).any():
+            plain.alpha_cutoff = 0.5
+            if ((colors[:, 3] > 0.0) & (colors[:, 3] < 1.0)).any():
+                self.findings.add("coverage between 0 and 1", f"colours of {name!r}")
         if normals is not None and normals.shape != points.shape:
             normals = None
         return Mesh(
@@ -118,6 +143,24 @@ class _Reader:
         if (id(image), srgb) not in self._textures:
             self._textures[id(image), srgb] = Texture("image", np.array(image.convert("RGBA")), srgb)
         return self._textures[id(image), srgb]
+
+
+def _given_normals(source: Any) -> np.ndarray | None:
+    """Return the normals of vertices that a mesh of trimesh was given, float32 [n, 3], or None.
+
+    They lie in its cache, as do those that trimesh computes when somebody looks at ``vertex_normals``; these are
+    computed again to tell them apart.
+    """
+    cache: Any = getattr(source, "_cache", {})
+    given = cache["vertex_normals"] if "vertex_normals" in cache else None
+    if given is None:
+        return None
+    from trimesh import Trimesh
+
+    fresh = Trimesh(np.array(source.vertices), np.array(source.faces), process=False).vertex_normals
+    if np.shape(given) == np.shape(fresh) and np.allclose(given, fresh, rtol=0.0, atol=1e-12, equal_nan=True):
+        return None
+    return np.asarray(given, np.float32)
 
 
 def _name(source: Any, otherwise: str) -> str:

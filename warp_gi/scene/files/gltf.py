@@ -23,13 +23,15 @@ from warp_gi.scene.files.support import BY_NAME
 from warp_gi.scene.model import Node, PunctualLight
 from warp_gi.scene.pinhole import Camera
 
+MOST_NODES = 1_000_000  # instances are nodes, too
 CAMERA_HEIGHT = 540  # pixels; a glTF camera has a shape but no resolution
 
 
 def read_gltf(path: Path) -> SceneParts:
     """Read a .glb or .gltf file; raises SceneError."""
     data = path.read_bytes()
-    text, binary = split_glb(memoryview(data), path) if path.suffix.lower() == ".glb" else (data, None)
+    is_binary = path.suffix.lower() == ".glb" or data[:4] == b"glTF"  # whatever its name is
+    text, binary = split_glb(memoryview(data), path) if is_binary else (data, None)
     document = Document(text, path)
     _check_extensions(document)
     return _Reader(document, Buffers(document, binary)).parts()
@@ -38,7 +40,7 @@ def read_gltf(path: Path) -> SceneParts:
 def _check_extensions(document: Document) -> None:
     """Raise SceneError for required extensions that are not supported, and note others that are not read in full."""
     read = {name for name, one in BY_NAME.items() if one.status in ("supported", "approximated")}
-    unknown = sorted({str(name) for name in document.root.get("extensionsRequired") or ()} - read)
+    unknown = sorted(set(document.listed_extensions("extensionsRequired")) - read)
     if unknown:
         raise SceneError(
             f"{str(document.path)!r} requires {', '.join(unknown)}, which is not supported; export it without"
@@ -76,16 +78,14 @@ class _Reader:
             sources.append((source, owner))
             nodes.append(self._node(source, owner, names, parent))
             nodes[-1].keyframes = keyframes.get(index)
-            for copy in self._instances(source, owner, nodes[-1], names, len(nodes) - 1):
-                nodes.append(copy)
-                sources.append(({}, owner))
+            copies = self._instances(source, owner, nodes[-1], names, len(nodes) - 1)
+            nodes += copies
+            sources += [({}, owner)] * len(copies)
         return self._with_lights_and_cameras(nodes, sources)
 
     def _node(self, source: Part, owner: str, names: _Names, parent: int | None) -> Node:
         document = self.document
-        weights = source.get("weights")
-        if weights is not None:
-            weights = document.numbers(source, "weights", owner, [0.0] * len(weights))
+        weights = document.weights(source, owner)
         if source.get("skin") is not None:
             document.findings.add("skins", owner)
         meshes = []
@@ -100,6 +100,12 @@ class _Reader:
             return []
         given = self.document.part(extension, "attributes", owner) or {}
         widths = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}
+        for name in (name for name in widths if given.get(name) is not None):
+            number = self.document.whole(self.document.item("accessors", given[name], owner), "count", owner)
+            if index + number >= MOST_NODES:
+                raise self.document.error(
+                    owner, f"has {number:,} instances; at most {MOST_NODES:,} nodes are supported"
+                )
         values = {
             name: self.buffers.accessor(given[name], f"{name} of {owner}", (width,))
             for name, width in widths.items()
@@ -143,7 +149,8 @@ class _Reader:
         document = self.document
         parts = SceneParts(nodes, findings=document.findings)
         moving, world = moving_nodes(nodes), world_matrices(nodes, 0.0)
-        described = (document.extension(document.root, "KHR_lights_punctual", "the file") or {}).get("lights", [])
+        listed = document.extension(document.root, "KHR_lights_punctual", "the file") or {}
+        described = document.objects(listed, "lights", "KHR_lights_punctual")
         names = _Names()
         for index, (source, owner) in enumerate(sources):
             extension = document.extension(source, "KHR_lights_punctual", owner)
@@ -167,7 +174,10 @@ class _Reader:
         what = document.name("cameras", index)
         lens = document.part(source, "perspective", what)
         if lens is None:
-            document.findings.add("orthographic cameras", what)
+            if source.get("type") == "orthographic" or "orthographic" in source:
+                document.findings.add("orthographic cameras", what)
+            else:
+                document.findings.lost.append(f"{str(self.path)!r}: {what} has no perspective lens; it is left out")
             return None
         aspect = document.number(lens, "aspectRatio", what, 16.0 / 9.0)
         vfov = document.number(lens, "yfov", what)

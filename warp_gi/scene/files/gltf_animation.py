@@ -60,11 +60,11 @@ def read_keyframes(document: Document, buffers: Buffers) -> dict[int, list[Keyfr
         document.findings.add("several animations")
     for index, animation in enumerate(animations):
         name = document.name("animations", index)
-        samplers = animation.get("samplers") or []
-        for channel in animation.get("channels") or ():
+        samplers = document.objects(animation, "samplers", name)
+        for channel in document.objects(animation, "channels", name):
             target = document.part(channel, "target", name) or {}
             path = target.get("path")
-            if target.get("node") is None or path not in WIDTHS:
+            if target.get("node") is None or not isinstance(path, str) or path not in WIDTHS:
                 if path == "weights":
                     document.findings.add("animation of morph weights", name)
                 continue

@@ -71,7 +71,7 @@ class Buffers:
             length = self.document.whole(description, "byteLength", f"buffer {index}")
             uri = description.get("uri")
             if uri is None:
-                if self.binary is None:
+                if self.binary is None or index > 0:  # the chunk is buffer 0; others are filled by extensions
                     raise self.document.error(f"buffer {index}", "has neither a uri nor a binary chunk")
                 data = self.binary
             elif not isinstance(uri, str):
@@ -112,7 +112,7 @@ class Buffers:
         description = document.item("accessors", index, owner)
         dtype = self._component(description, name)
         kind = description.get("type")
-        if kind not in WIDTHS:
+        if not isinstance(kind, str) or kind not in WIDTHS:
             raise document.error(name, f"type must be one of {', '.join(WIDTHS)}, got {kind!r}")
         width = WIDTHS[kind]
         if widths and width not in widths:
@@ -132,13 +132,18 @@ class Buffers:
             values = np.maximum(values.astype(np.float32) / np.iinfo(dtype.name).max, -1.0)
         return values[:, 0] if width == 1 else values
 
+    def has_data(self, index: object, owner: str) -> bool:
+        """Return whether an accessor has numbers in the file; without, it is all zero, or an extension fills it."""
+        description = self.document.item("accessors", index, owner)
+        return description.get("bufferView") is not None or description.get("sparse") is not None
+
     def _component(self, description: Part, name: str) -> np.dtype:
         component = description.get("componentType")
-        if component not in COMPONENTS:
+        if not isinstance(component, int | float) or component not in COMPONENTS:
             raise self.document.error(
                 name, f"componentType must be one of {', '.join(map(str, COMPONENTS))}, got {component!r}"
             )
-        return np.dtype(COMPONENTS[component]).newbyteorder("<")
+        return np.dtype(COMPONENTS[int(component)]).newbyteorder("<")
 
     def _sparse(self, values: np.ndarray, sparse: Part, dtype: np.dtype, name: str) -> np.ndarray:
         """Write the values of a sparse accessor over ``values`` [count, width], and return these."""
@@ -148,6 +153,8 @@ class Buffers:
             raise document.error(name, "its sparse part lacks indices or values")
         number = document.whole(sparse, "count", name)
         kind = self._component(where, name)
+        if kind.kind not in "iu":
+            raise document.error(name, "the indices of its sparse part must be whole numbers")
         offsets = [document.whole(one, "byteOffset", name, 0) for one in (where, what)]
         rows = self._read(where.get("bufferView"), offsets[0], number, 1, kind, name)[:, 0]
         if len(rows) and int(rows.max()) >= len(values):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from warp_gi.scene.files.support import Findings
 Part = dict[str, Any]
 """An object of the JSON text."""
 
+LARGEST = sys.float_info.max
 SINGULAR = {"meshes": "mesh", "bufferViews": "buffer view"}
 
 
@@ -103,8 +105,8 @@ class Document:
 
     def number(self, source: Part, key: str, owner: str, default: float | None = None) -> float:
         """Return a field that is a number; None as the default says that it must be there."""
-        value = source.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        value: Any = source.get(key, default)
+        if not _is_number(value):
             raise self.error(owner, f"{key} must be a number, got {value!r:.60}" if key in source else f"lacks {key}")
         return float(value)
 
@@ -113,13 +115,23 @@ class Document:
         value = source.get(key)
         if value is None:
             return tuple(default)
-        if (
-            not isinstance(value, list)
-            or len(value) != len(default)
-            or any(isinstance(one, bool) or not isinstance(one, int | float) for one in value)
-        ):
+        if not isinstance(value, list) or len(value) != len(default) or not all(map(_is_number, value)):
             raise self.error(owner, f"{key} must be {len(default)} numbers, got {value!r:.60}")
         return tuple(float(one) for one in value)
+
+    def weights(self, source: Part, owner: str) -> tuple[float, ...] | None:
+        """Return the weights of morph targets, or None if there are none."""
+        value = source.get("weights")
+        if value is not None and (not isinstance(value, list) or not all(map(_is_number, value))):
+            raise self.error(owner, f"weights must be a list of numbers, got {value!r:.60}")
+        return None if value is None else tuple(float(one) for one in value)
+
+    def objects(self, source: Part, key: str, owner: str) -> list[Part]:
+        """Return a field that is a list of objects; empty if it is absent."""
+        value = source.get(key)
+        if value is not None and (not isinstance(value, list) or not all(isinstance(one, dict) for one in value)):
+            raise self.error(owner, f"{key} must be a list of objects, got {value!r:.60}")
+        return value or []
 
     def whole(self, source: Part, key: str, owner: str, default: int | None = None) -> int:
         """Return a field that is a whole number from 0 up; None as the default says that it must be there."""
@@ -145,12 +157,19 @@ class Document:
 
     # ---- extensions ----
 
+    def listed_extensions(self, key: str) -> list[str]:
+        """Return the names in ``extensionsUsed`` or ``extensionsRequired``."""
+        names = self.root.get(key)
+        if names is not None and (not isinstance(names, list) or not all(isinstance(name, str) for name in names)):
+            raise self.error("the file", f"{key} must be a list of texts, got {names!r:.60}")
+        return names or []
+
     def used_extensions(self) -> dict[str, list[str]]:
         """Return the extensions that parts of the file carry or that it says it uses, and the parts that carry them."""
         found: dict[str, list[str]] = {}
         for key in ("extensionsUsed", "extensionsRequired"):
-            for name in self.root.get(key) or ():
-                found.setdefault(str(name), [])
+            for name in self.listed_extensions(key):
+                found.setdefault(name, [])
         for kind, values in self.root.items():
             if isinstance(values, list):
                 for index, value in enumerate(values):
@@ -163,6 +182,11 @@ class Document:
         for name in self.part(self.root, "extensions", "the file") or {}:
             found.setdefault(name, [])
         return found
+
+
+def _is_number(value: object) -> bool:
+    """Return whether a value is a finite number; JSON of some programs has NaN, and whole numbers of any length."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and -LARGEST <= value <= LARGEST
 
 
 def _extensions(value: Any) -> Iterator[str]:

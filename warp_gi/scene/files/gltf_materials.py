@@ -30,6 +30,8 @@ class Coordinates:
     """Their transform, v down, float64 [3, 3]."""
     further: int | None = None
     """Second set, or None."""
+    needed: bool = False
+    """Whether a texture is looked up at them."""
 
 
 class MaterialReader:
@@ -73,7 +75,7 @@ class MaterialReader:
         )
         reflectance = scaled(
             document.numbers(coat, "specularColorFactor", what, (1.0,) * 3),
-            _normal_reflectance(document.number(ior, "ior", what, 1.5)),
+            _normal_reflectance(document, ior, what),
         )
         result = Material(
             document.text(source, "name") or what,
@@ -122,7 +124,7 @@ class MaterialReader:
         others = dict.fromkeys(number for number, _ in found if number != found[0][0])
         if len(others) > 1:
             self.document.findings.add("a third set of texture coordinates", what)
-        return Coordinates(*found[0], next(iter(others), None))
+        return Coordinates(*found[0], next(iter(others), None), needed=True)
 
     def _converted(self, material: Material, old: Part, slot: _Slots, what: str) -> Material:
         """Return a material with what KHR_materials_pbrSpecularGlossiness says of it.
@@ -251,8 +253,11 @@ def scaled(values: tuple[float, ...], factor: float) -> Color:
     return red, green, blue
 
 
-def _normal_reflectance(ior: float) -> float:
-    """Return the reflectance of an index of refraction at normal incidence; 0 stands for one that is infinite."""
+def _normal_reflectance(document: Document, extension: Part, what: str) -> float:
+    """Return the reflectance of KHR_materials_ior at normal incidence; 0 stands for an infinite index of refraction."""
+    ior = document.number(extension, "ior", what, 1.5)
+    if ior < 0.0:
+        raise document.error(what, f"ior must be 0 or from 1 up, got {ior:g}")
     return 0.04 if ior == 1.5 else ((ior - 1.0) / (ior + 1.0)) ** 2
 
 

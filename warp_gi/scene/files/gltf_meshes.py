@@ -29,12 +29,10 @@ class MeshReader:
         source = self.document.item("meshes", index, owner)
         name = self.document.name("meshes", index)
         if weights is None:
-            weights = source.get("weights") or ()
+            weights = self.document.weights(source, name) or ()
         key = index, tuple(weights) if any(weights) else ()
         if key not in self._meshes:
-            primitives = source.get("primitives") or []
-            if not isinstance(primitives, list) or not all(isinstance(one, dict) for one in primitives):
-                raise self.document.error(name, "primitives must be a list of objects")
+            primitives = self.document.objects(source, "primitives", name)
             label = self.document.text(source, "name") or name
             found = (self._primitive(one, name, label, key[1]) for one in primitives)
             self._meshes[key] = [mesh for mesh in found if mesh is not None]
@@ -53,6 +51,11 @@ class MeshReader:
         if attributes.get("POSITION") is None:
             document.findings.add("primitives without positions", owner)
             return None
+        for what, number in (("POSITION", attributes["POSITION"]), ("indices", source.get("indices"))):
+            if number is not None and not self.buffers.has_data(number, owner):
+                raise document.error(
+                    owner, f"{what} is accessor {number}, which holds no data; export it without compression"
+                )
         points = np.ascontiguousarray(self.buffers.accessor(attributes["POSITION"], owner, (3,)), np.float32)
         corners = np.arange(len(points))
         if source.get("indices") is not None:
@@ -76,7 +79,7 @@ class MeshReader:
             label,
             further_uvs=None
             if coordinates.further is None
-            else self._uvs(attributes, Coordinates(coordinates.further), owner, len(points)),
+            else self._uvs(attributes, Coordinates(coordinates.further, needed=True), owner, len(points)),
             colors=self._colors(attributes, owner, len(points)),
         )
 
@@ -95,6 +98,8 @@ class MeshReader:
         """Return the texture coordinates that a material asks for, v up."""
         uvs = self._attribute(attributes, f"TEXCOORD_{wanted.number}", owner, count, (2,))
         if uvs is None:
+            if wanted.needed:
+                self.document.findings.add("textures without their coordinates", f"TEXCOORD_{wanted.number} of {owner}")
             return None
         uvs = uvs @ wanted.transform[:2, :2].T.astype(np.float32) + wanted.transform[:2, 2]
         return np.stack([uvs[:, 0], 1.0 - uvs[:, 1]], axis=1).astype(np.float32)
@@ -113,12 +118,14 @@ class MeshReader:
         self, source: Part, owner: str, weights: Sequence[float], points: np.ndarray, normals: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """Return positions and normals with the weighted morph targets added."""
-        targets = source.get("targets") or []
+        targets = self.document.objects(source, "targets", owner)
         if len(targets) != len(weights):
             raise self.document.error(owner, f"has {len(targets)} morph targets and {len(weights)} weights")
         moved = points.astype(np.float64)
         turned = None if normals is None else normals.astype(np.float64)
         for target, weight in zip(targets, weights, strict=True):
+            if weight and any(name.startswith(("COLOR_", "TEXCOORD_")) for name in target):
+                self.document.findings.add("morph targets of colours and texture coordinates", owner)
             shift = self._attribute(target, "POSITION", owner, len(points), (3,))
             if shift is not None:
                 moved += weight * shift

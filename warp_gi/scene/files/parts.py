@@ -29,23 +29,43 @@ class SceneParts:
 
     def middle(self) -> np.ndarray:
         """Return a point that half of the triangles lie before along each axis, float64 [3], at time 0."""
+        places, _, counts = self._boxes()
+        if not len(places):
+            return np.zeros(3)
+        order = np.argsort(places, axis=0, kind="stable")
+        sums = np.cumsum(counts[order], axis=0)
+        return np.array([places[order[np.searchsorted(s, s[-1] / 2), k], k] for k, s in enumerate(sums.T)])
+
+    def bounds(self) -> np.ndarray:
+        """Return the lowest and highest corner around the boxes of all meshes, float64 [2, 3], at time 0."""
+        middles, halves, _ = self._boxes()
+        if not len(middles):
+            return np.zeros((2, 3))
+        return np.stack([(middles - halves).min(axis=0), (middles + halves).max(axis=0)])
+
+    def _boxes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return middle and half size of each placed mesh's box, float64 [n, 3], and its triangles [n], at time 0.
+
+        The box is one along the world's axes, around that along the mesh's own.
+        """
         boxes: dict[int, np.ndarray] = {}
-        places, counts = [], []
+        found, matrices, counts = [], [], []
         for node, matrix in zip(self.nodes, world_matrices(self.nodes, 0.0), strict=True):
             for mesh in node.meshes:
                 if id(mesh) not in boxes:
                     used = mesh.indices[(mesh.indices >= 0) & (mesh.indices < len(mesh.points))]
                     corners = np.asarray(mesh.points)[used]
                     corners = corners[np.isfinite(corners).all(axis=1)]
-                    boxes[id(mesh)] = np.array([corners.min(axis=0), corners.max(axis=0)] if len(corners) else [])
+                    rows = [corners.min(axis=0), corners.max(axis=0)] if len(corners) else []
+                    boxes[id(mesh)] = np.array(rows, np.float64)
                 if len(boxes[id(mesh)]):
-                    places.append(matrix[:3, :3] @ boxes[id(mesh)].mean(axis=0, dtype=np.float64) + matrix[:3, 3])
+                    found.append(boxes[id(mesh)])
+                    matrices.append(matrix)
                     counts.append(len(mesh.indices))
-        if not places:
-            return np.zeros(3)
-        order = np.argsort(places, axis=0, kind="stable")
-        sums = np.cumsum(np.array(counts)[order], axis=0)
-        return np.array([np.array(places)[order[np.searchsorted(s, s[-1] / 2), k], k] for k, s in enumerate(sums.T)])
+        ends, placed = np.array(found).reshape(-1, 2, 3), np.array(matrices).reshape(-1, 4, 4)
+        middles = np.einsum("nij,nj->ni", placed[:, :3, :3], ends.mean(axis=1)) + placed[:, :3, 3]
+        halves = np.einsum("nij,nj->ni", np.abs(placed[:, :3, :3]), (ends[:, 1] - ends[:, 0]) / 2)
+        return middles, halves, np.array(counts)
 
     def recentred(self, offset: np.ndarray) -> SceneParts:
         """Return the parts with ``offset`` taken from all positions, in double precision."""
@@ -60,7 +80,9 @@ class SceneParts:
                 node.keyframes is None and index not in parents and np.array_equal(node.parent_from_node, np.eye(4))
             )
             if is_bare:  # its points may be doubles: they are moved before the cast
-                return replace(node, meshes=[replace(mesh, points=mesh.points - offset) for mesh in node.meshes])
+                x, y, z = (offset + node.pivot).tolist()
+                moved = [replace(mesh, points=mesh.points - offset) for mesh in node.meshes]
+                return replace(node, meshes=moved, pivot=(x, y, z))
             keys = moved_keyframes(node.keyframes or (), -offset)
             return replace(node, parent_from_node=back @ node.parent_from_node, keyframes=keys or None)
 

@@ -20,6 +20,7 @@ from warp_gi.errors import SceneError, one_line
 from warp_gi.files import user_path
 
 LARGEST_HEIGHT = 4096  # texel coordinates must be exact in float32 with bits left to interpolate
+LARGEST_WINDOW = 4 * LARGEST_HEIGHT  # pixels a side of a data window, which may be larger than the display window
 BEAUTY = ("beauty", "combined", "rgba", "rgb", "default")
 """Names, in lower case, of parts and layers that hold the picture itself, the likeliest first."""
 COLORS = ({"r", "red"}, {"g", "green"}, {"b", "blue"})
@@ -59,10 +60,14 @@ class RadianceHeader:
 def split_layer(text: str | Path) -> tuple[Path, str]:
     """Return the file and the layer of "FILE:layer"; the layer of a mere file is "". A name with a colon may be one."""
     path = user_path(text)
-    match = re.fullmatch(r"(.+\.\w+):([^/\\]+)", str(path))
-    if not match or path.is_file():
+    text = str(path)
+    if path.is_file():
         return path, ""
-    return Path(match[1]), match[2]
+    for colon in re.finditer(":", text):  # a layer may have colons and slashes of its own
+        if Path(text[: colon.start()]).is_file():
+            return Path(text[: colon.start()]), text[colon.end() :]
+    match = re.fullmatch(r"(.+\.\w+):([^/\\]+)", text) or re.fullmatch(r"(.*#[^/\\:]*\.\w+):(.+)", text)
+    return (Path(match[1]), match[2]) if match else (path, "")
 
 
 def check_size(name: str, width: int, height: int) -> None:
@@ -122,14 +127,21 @@ def _read_pixels(path: Path, name: str, wanted: str, orientation: int = 0) -> np
         orientation = orientation or spec.get_int_attribute("Orientation", 1)
         full = (spec.full_width, spec.full_height)
         check_size(name, *(full[::-1] if orientation > 4 else full))
-        pixels = image.read_image(layer.part, 0, 0, spec.nchannels, oiio.FLOAT)
+        if max(spec.width, spec.height) > LARGEST_WINDOW:
+            raise SceneError(
+                f"{name}: its data window is {spec.width}x{spec.height}, at most {LARGEST_WINDOW} a side is supported;"
+                " crop it to the display window"
+            )
+        first, last = min(layer.channels), max(layer.channels)
+        pixels = image.read_image(layer.part, 0, first, last + 1, oiio.FLOAT)
         if pixels is None or image.has_error:
             raise SceneError(
                 f"{name}: the image is damaged or cut short ({one_line(image.geterror(), 'no reason given')})"
             )
     finally:
         image.close()
-    pixels = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)[..., layer.channels]
+    pixels = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, last + 1 - first)
+    pixels = pixels[..., [channel - first for channel in layer.channels]]
     if spec.format.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE):
         pixels = decode_srgb(pixels)
     pixels = _upright(_in_display_window(pixels, spec), orientation)
@@ -150,6 +162,7 @@ def _layers(image: Any, name: str) -> list[Layer]:
             found += _layers_of(spec, part)
         part += 1
     image.seek_subimage(0, 0)
+    image.geterror()  # some readers keep that there was no further part, as if reading had failed
     first = image.spec(0)
     if found:
         return found
@@ -260,13 +273,13 @@ def _read_radiance(path: Path, name: str, layer: str) -> np.ndarray:
 def parse_radiance(data: bytes, name: str) -> RadianceHeader:
     """Return what the header of a Radiance picture says; raises SceneError for numbers that are none."""
     header = RadianceHeader()
-    end = data.find(b"\n\n")
-    order = re.match(rb"([-+])([XY])\s+\d+\s+([-+])[XY]\s+\d+", data[end + 2 :])
+    blank = re.search(rb"\r?\n\r?\n", data)
+    end, start = blank.span() if blank else (len(data), len(data))
+    order = re.match(rb"([-+])([XY])\s+\d+\s+([-+])[XY]\s+\d+", data[start : start + 256])
     if order:
         header.orientation = ORIENTATIONS[(order[1] + order[2] + order[3]).decode()]
-    for line in data[:end].decode("latin-1").splitlines():
-        key, _, value = line.partition("=")
-        key = key.strip()
+    for line in re.split("\r?\n", data[:end].decode("latin-1")):
+        key, _, value = line.partition("=")  # an indented line is a note of the picture that this one was made of
         if key == "FORMAT":
             header.is_xyz = value.strip() == "32-bit_rle_xyze"
         elif key in ("EXPOSURE", "COLORCORR", "PRIMARIES"):

@@ -82,6 +82,8 @@ FEATURES: tuple[Feature, ...] = (
         "ignored",
         ("COLOR_1 and above", GLTF, "only the first set of colours has a meaning in glTF"),
         ("TEXCOORD_1 and above, of no texture", GLTF, "no texture asks for them"),
+        ("morph targets of colours and texture coordinates", GLTF, "only positions and normals move"),
+        ("textures without their coordinates", GLTF, "the colour of one point of the texture, as at (0, 0)"),
         ("animation of morph weights", GLTF, "the mesh keeps its shape"),
         ("skins", GLTF, "the mesh keeps the shape and the place of its node"),
         ("points and lines", f"{GLTF}, {OBJ}, {PLY}", "only surfaces are rendered"),
