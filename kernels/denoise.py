@@ -108,6 +108,7 @@ class DenoiseSettings:
     luminance: wp.float32
     filters_diffuse: wp.int32  # in this level
     filters_glossy: wp.int32
+    settles: wp.int32  # 1: there is an average over frames; 0: this is the first one
 
 
 # a / b where b is above nothing.

@@ -247,7 +247,7 @@ def with_sample(
     own_color = guides.guide_diffuse[pixel] + guides.guide_specular[pixel]
     r.differ = r.differ or elsewhere or colors_differ(own_color, s.bsdf.diffuse + specular)
     known = SharedLight()
-    if not elsewhere:
+    if not elsewhere and settings.settles != 0:
         known = own_light(light, pixel, s.bsdf.diffuse, specular)
     if not known.seen:
         known = shared_light(settings, guides, light, s, hit.t, at[0], at[1])

@@ -10,7 +10,7 @@ from scene_tools import card, quad
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.denoise import Oidn, SpatioTemporal
+from warp_gi.denoise import Oidn, SpatioTemporal, spatiotemporal
 from warp_gi.errors import OptionError
 from warp_gi.kernels import denoise, denoise_edges
 
@@ -830,3 +830,18 @@ def test_coverage_is_of_the_samples_that_edges_take():
             beauty, alpha = frame.numpy("beauty").mean(-1), frame.numpy("alpha")
         assert 0 < ((alpha > 0) & (alpha < 1)).mean() < 0.2
         np.testing.assert_allclose(beauty + (1 - alpha) * 0.8, 0.8, atol=bound)
+
+
+def test_a_first_frame_is_filtered_more(monkeypatch):
+    """Four samples on bumps and thin things: wider weights, light from around and more samples at edges lower its error."""
+    shot, camera = gi.builtin_scene("atrium"), gi.builtin_camera_path("atrium").at_resolution(96, 54).camera(0)
+    reference = next(gi.render(shot, camera, gi.Pipeline(spp=128, camera_samples=64))).numpy("beauty")
+    dark = reference.max(axis=-1) < 2  # outlines of lamps are no light
+    errors = []
+    for factors in ((0.25, 2.0, 2), (1.0, 1.0, 1)):
+        for name, factor in zip(("FIRST_NORMAL", "FIRST_LUMINANCE", "FIRST_EDGES"), factors, strict=True):
+            monkeypatch.setattr(spatiotemporal, name, factor)
+        pipeline = gi.Pipeline(spp=1, denoise=SpatioTemporal())
+        beauty = next(gi.render(shot, camera, pipeline, seed=2)).numpy("beauty")
+        errors.append(gi.metrics.rmse(beauty[dark][None], reference[dark][None]))
+    assert errors[0] < 0.95 * errors[1], errors

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 MOST_LEVELS = 8
 LONG = 4.0
 """Frames from which on an average knows its variance, if the first one has as many samples as others."""
+FIRST_NORMAL, FIRST_LUMINANCE, FIRST_EDGES = 0.25, 2.0, 2
+"""Factors of `normal_power`, `luminance` and `edge_samples` in a frame that no frame leads to: few samples, which bumps
+of a surface keep apart, leave dots."""
 CLIP = 1.5
 """Standard deviations of the pixels around a pixel, to which the last picture is limited in it."""
 
@@ -65,7 +68,7 @@ class SpatioTemporal(Denoiser):
 
     first_samples: int = 4
     """Samples a pixel, at least, of a frame without a frame before, 1 to 65536: the first one, a still, or after a cut.
-    There is no average yet that would make up for few."""
+    There is no average yet that would make up for few. Its filter is wider, and edges take twice as many samples."""
     apart_frames: int = 4
     """Most frames in the average of diffuse light from small suns of a sky, and from lights without size if there are
     at most four and no emissive surfaces; 1 to 1024. Each gets a ray of its own, and its shadows are not filtered
@@ -135,6 +138,9 @@ class SpatioTemporal(Denoiser):
         has_history = state.leads_to(frame)
         if has_history:
             average, changes = self._accumulated(frame, settings, state, guides, average)
+        if not has_history:
+            settings.settles, settings.normal = 0, FIRST_NORMAL * settings.normal
+            settings.luminance = FIRST_LUMINANCE * settings.luminance
         filtered = self._filtered(frame, settings, guides, average, 0 if has_history else 1)
         apart = self._apart(frame, settings, state if has_history else None, guides, filtered)
         frame.launch(denoise.put_back, [light, guides, filtered, frame["beauty"]])
@@ -237,6 +243,8 @@ class SpatioTemporal(Denoiser):
         picture.less = wp.zeros_like(frame["depth"])
         if changes is not None and last is not None:
             frame.launch(denoise_edges.mark_changes, [settings, changes, picture.less])
+        if settings.settles == 0:
+            edges.samples *= FIRST_EDGES
         if edges.samples > 0:
             inputs = [frame.seen_data, frame.camera_data, settings, edges, guides, filtered, picture]
             frame.launch_tiled(denoise_edges.sample_edges, inputs)
@@ -265,7 +273,7 @@ class SpatioTemporal(Denoiser):
         settings.diffuse_frames, settings.glossy_frames = self.frames, self.glossy_frames
         settings.worth = frame.settings.spp / frame.pipeline_samples
         settings.settled = LONG - 1.0 + max(1.0, self.first_samples / frame.pipeline_samples)
-        settings.lag, settings.luminance = self.lag, self.luminance
+        settings.lag, settings.luminance, settings.settles = self.lag, self.luminance, 1
         settings.normal, settings.plane = self.normal_power, self.plane_distance
         return settings
 
