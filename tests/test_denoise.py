@@ -833,7 +833,7 @@ def test_coverage_is_of_the_samples_that_edges_take():
 
 
 def test_a_first_frame_is_filtered_more(monkeypatch):
-    """Four samples on bumps and thin things: wider weights, light from around and more samples at edges lower its error."""
+    """Four samples on bumps and thin things: wider weights and more samples at edges lower its error."""
     shot, camera = gi.builtin_scene("atrium"), gi.builtin_camera_path("atrium").at_resolution(96, 54).camera(0)
     reference = next(gi.render(shot, camera, gi.Pipeline(spp=128, camera_samples=64))).numpy("beauty")
     dark = reference.max(axis=-1) < 2  # outlines of lamps are no light
