@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -54,8 +54,7 @@ class History:
 
     def saved_arrays(self) -> dict[str, np.ndarray]:
         """Return what the next frame reads, as arrays."""
-        parts = {f"{name}": getattr(self.guides, name) for name in READ_GUIDES}
-        parts |= {name: getattr(self.average, name) for name in launch.fields_of(denoise.Signals)}
+        parts = {name: getattr(struct, name) for struct, name in _read_next(self.guides, self.average)}
         parts |= {} if self.picture is None else {"picture": self.picture}
         parts |= {} if self.apart is None else {"apart": self.apart.average}
         frame = {
@@ -71,10 +70,7 @@ class History:
         device = self.average.length.device
         index, *size = (int(number) for number in arrays["frame"].reshape(3))
         guides, average = _empty(denoise.Guides, device), _empty(denoise.Signals, device)
-        for struct, name in [
-            *((guides, n) for n in READ_GUIDES),
-            *((average, n) for n in launch.fields_of(denoise.Signals)),
-        ]:
+        for struct, name in _read_next(guides, average):
             setattr(struct, name, _loaded(arrays[name], getattr(struct, name).dtype, size[0] * size[1], device))
         picture, apart = None, None
         if "picture" in arrays:
@@ -97,6 +93,11 @@ class History:
 
 READ_GUIDES = ("guide_object", "guide_normal", "guide_position")
 """Guides that the next frame reads (``denoise.same_surface``)."""
+
+
+def _read_next(guides: denoise.Guides, average: denoise.Signals) -> list[tuple[Any, str]]:
+    """Return what the next frame reads of a frame's structs: a struct, and the name of an array in it."""
+    return [(guides, name) for name in READ_GUIDES] + [(average, name) for name in launch.fields_of(denoise.Signals)]
 
 
 def _empty(struct: type[launch.Struct], device: wp.Device) -> launch.Struct:
