@@ -22,7 +22,7 @@ from warp_gi.kernels.denoise import (
     glossy_scale,
 )
 from warp_gi.kernels.environment import environment_radiance
-from warp_gi.kernels.gbuffer import CameraData, camera_ray, tiled_pixel
+from warp_gi.kernels.gbuffer import CameraData, camera_origin, camera_ray, tiled_pixel, view_distance
 from warp_gi.kernels.sampling import CAMERA_DIMENSION, circle, filter_offset, hash_uint, sample_1d, sample_2d
 from warp_gi.kernels.surface import Surface, shading_normal, surface_at, surface_emission
 from warp_gi.kernels.types import SceneData
@@ -234,7 +234,7 @@ def with_sample(
 ) -> EdgeSums:
     r = sums
     direction = camera_ray(camera, at[0], at[1])
-    hit = bvh_intersect(scene.bvh, camera.position, direction, float(wp.inf))
+    hit = bvh_intersect(scene.bvh, camera_origin(camera, at[0], at[1]), direction, float(wp.inf))
     if hit.face < 0:
         r.differ = r.differ or guides.guide_object[pixel] != 0
         r.shining += environment_radiance(scene.environment, direction)
@@ -250,7 +250,7 @@ def with_sample(
     if not elsewhere and settings.settles != 0:
         known = own_light(light, pixel, s.bsdf.diffuse, specular)
     if not known.seen:
-        known = shared_light(settings, guides, light, s, hit.t, at[0], at[1])
+        known = shared_light(settings, guides, light, s, view_distance(camera, hit.t), at[0], at[1])
     if known.seen:
         r.reflected += wp.cw_mul(s.bsdf.diffuse, known.diffuse) + wp.cw_mul(glossy_scale(specular), known.glossy)
         r.shining += surface_emission(scene, hit.face, hit.u, hit.v, -direction)

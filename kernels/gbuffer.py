@@ -15,7 +15,8 @@ TILE = 8  # pixels; items run through square tiles, so that neighbours in time a
 
 
 # `right` and `up` are scaled so that forward + x right + y up with x, y in [-1, 1] spans the picture, once `center` is
-# added to x and y: where its middle is on that plane. It is zero without a lens shift.
+# added to x and y: where its middle is on that plane. It is zero without a lens shift. Rays of an orthographic camera
+# are parallel to `forward` and begin on the plane through `position`, at right x + up y from it.
 @wp.struct
 class CameraData:
     position: wp.vec3
@@ -23,6 +24,7 @@ class CameraData:
     up: wp.vec3
     forward: wp.vec3
     center: wp.vec2
+    spread: wp.float32  # 1: rays part from `position`; 0: orthographic
     width: wp.int32
     height: wp.int32
 
@@ -84,32 +86,49 @@ def tiled_pixel(item: wp.int32, width: wp.int32) -> wp.vec2i:
     return wp.vec2i((tile - row * per_row) * TILE + inside - y * TILE, row * TILE + y)
 
 
+# Where a point of the picture is on the camera's plane at 1 m, from the middle of that plane; pixel coordinates.
 @wp.func
-def camera_ray(camera: CameraData, x: wp.float32, y: wp.float32) -> wp.vec3:
+def on_plane(camera: CameraData, x: wp.float32, y: wp.float32) -> wp.vec3:
     sx = 2.0 * x / wp.float32(camera.width) - 1.0 + camera.center[0]
     sy = 1.0 - 2.0 * y / wp.float32(camera.height) + camera.center[1]
-    return wp.normalize(camera.forward + camera.right * sx + camera.up * sy)
+    return camera.right * sx + camera.up * sy
 
 
-# Pixel coordinates of a direction from the camera; inverse of camera_ray.
+@wp.func
+def camera_origin(camera: CameraData, x: wp.float32, y: wp.float32) -> wp.vec3:
+    return camera.position + on_plane(camera, x, y) * (1.0 - camera.spread)
+
+
+@wp.func
+def camera_ray(camera: CameraData, x: wp.float32, y: wp.float32) -> wp.vec3:
+    return wp.normalize(camera.forward + on_plane(camera, x, y) * camera.spread)
+
+
+# Distance at which a pixel is as wide as it is at a hit: `t` along the ray, and 1 in an orthographic camera.
+@wp.func
+def view_distance(camera: CameraData, t: wp.float32) -> wp.float32:
+    return t * camera.spread + (1.0 - camera.spread)
+
+
+# Pixel coordinates of a point relative to the camera's position; for a perspective camera of a direction, too.
 @wp.func
 def project(camera: CameraData, direction: wp.vec3) -> wp.vec2:
-    z = wp.max(wp.dot(direction, camera.forward), 1.0e-9)
+    z = wp.max(wp.dot(direction, camera.forward), 1.0e-9) * camera.spread + (1.0 - camera.spread)
     x = wp.dot(direction, camera.right) / (wp.length_sq(camera.right) * z) - camera.center[0]
     y = wp.dot(direction, camera.up) / (wp.length_sq(camera.up) * z) - camera.center[1]
     return wp.vec2(0.5 * (x + 1.0) * wp.float32(camera.width), 0.5 * (1.0 - y) * wp.float32(camera.height))
 
 
-# Direction of the camera ray of a pixel; jittered unless there is only one camera sample.
+# Picture coordinates of the camera ray of a pixel; jittered unless there is only one camera sample.
 @wp.func
-def primary_direction(camera: CameraData, settings: PassSettings, p: wp.vec2i) -> wp.vec3:
+def primary_sample(settings: PassSettings, p: wp.vec2i) -> wp.vec2:
     offset = wp.vec2(0.0, 0.0)
     if settings.camera_samples > 1:
         index = pixel_sample_index(p[0], p[1], settings.camera_sample, settings.camera_bits)
         seed = pixel_seed(p[0], p[1], settings.camera_bits, settings.seed)
         u = sample_2d(index, seed, CAMERA_DIMENSION)
         offset = wp.vec2(filter_offset(settings.tent, u[0]), filter_offset(settings.tent, u[1]))
-    return camera_ray(camera, wp.float32(p[0]) + 0.5 + offset[0], wp.float32(p[1]) + 0.5 + offset[1])
+    return wp.vec2(wp.float32(p[0]) + 0.5 + offset[0], wp.float32(p[1]) + 0.5 + offset[1])
 
 
 # Thread: a pixel. Traces one camera ray.
@@ -118,8 +137,9 @@ def trace_primary(first: wp.int32, scene: SceneData, camera: CameraData, setting
     p = tiled_pixel(first + wp.tid(), camera.width)
     if p[0] >= camera.width or p[1] >= camera.height:
         return
-    direction = primary_direction(camera, settings, p)
-    hit = bvh_intersect(scene.bvh, camera.position, direction, float(wp.inf))
+    at = primary_sample(settings, p)
+    direction = camera_ray(camera, at[0], at[1])
+    hit = bvh_intersect(scene.bvh, camera_origin(camera, at[0], at[1]), direction, float(wp.inf))
     pixel = p[1] * camera.width + p[0]
     hits.direction[pixel] = direction
     hits.t[pixel] = hit.t
@@ -143,7 +163,7 @@ def add_guides(
     buffers: SurfaceBuffers,
     pixel: wp.int32,
     s: Surface,
-    t: wp.float32,
+    distance: wp.float32,
     was: wp.vec3,
     motion: wp.vec2,
     object_id: wp.int32,
@@ -152,7 +172,7 @@ def add_guides(
     buffers.guide_diffuse[pixel] = buffers.guide_diffuse[pixel] + s.bsdf.diffuse
     buffers.guide_specular[pixel] = buffers.guide_specular[pixel] + average_specular(s.bsdf)
     if buffers.guide_object[pixel] == 0:
-        buffers.guide_distance[pixel] = t
+        buffers.guide_distance[pixel] = distance
         buffers.guide_position[pixel] = s.position
         buffers.guide_previous[pixel] = was
         buffers.guide_motion[pixel] = motion
@@ -193,13 +213,14 @@ def shade_primary(
         buffers.albedo[pixel] = buffers.albedo[pixel] + s.base_color
         buffers.normal[pixel] = buffers.normal[pixel] + shading_normal(s)
         was = previous_position(scene.geometry, face, u, v)
-        motion = project(previous_camera, was - previous_camera.position) - project(camera, direction)
+        seen = wp.where(camera.spread > 0.0, direction, s.position - camera.position)
+        motion = project(previous_camera, was - previous_camera.position) - project(camera, seen)
         position = s.position
         depth = wp.dot(position - camera.position, camera.forward)
         object_id = scene.geometry.objects[face]
         material_id = scene.geometry.materials[face]
         if buffers.guide_object.shape[0] > 0:
-            add_guides(buffers, pixel, s, hits.t[pixel], was, motion, object_id)
+            add_guides(buffers, pixel, s, view_distance(camera, hits.t[pixel]), was, motion, object_id)
     if settings.camera_sample == 0:
         buffers.position[pixel] = position
         buffers.depth[pixel] = depth

@@ -5,7 +5,7 @@ import warp as wp
 from warp_gi.kernels.bsdf import bsdf_sample
 from warp_gi.kernels.bvh import bvh_intersect
 from warp_gi.kernels.environment import environment_radiance
-from warp_gi.kernels.gbuffer import CameraData, camera_ray
+from warp_gi.kernels.gbuffer import CameraData, camera_origin, camera_ray
 from warp_gi.kernels.light_field import LightField
 from warp_gi.kernels.path_trace import (
     NO_PATH,
@@ -136,8 +136,10 @@ def follow_paths(
     path = first + wp.tid()
     index = wp.uint32(path)
     u = sample_2d(index, seed, CAMERA_DIMENSION)
-    origin = camera.position
-    direction = camera_ray(camera, u[0] * wp.float32(camera.width), u[1] * wp.float32(camera.height))
+    x = u[0] * wp.float32(camera.width)
+    y = u[1] * wp.float32(camera.height)
+    origin = camera_origin(camera, x, y)
+    direction = camera_ray(camera, x, y)
     vertices = int(REACH_VERTICES)
     for k in range(vertices):
         hit = bvh_intersect(scene.bvh, origin, direction, float(wp.inf))

@@ -17,7 +17,15 @@ from warp_gi.kernels.bsdf import (
     specular_sample,
 )
 from warp_gi.kernels.bvh import BvhHit, bvh_intersect
-from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, primary_direction, tiled_pixel
+from warp_gi.kernels.gbuffer import (
+    CameraData,
+    PassSettings,
+    PrimaryHits,
+    camera_origin,
+    camera_ray,
+    primary_sample,
+    tiled_pixel,
+)
 from warp_gi.kernels.light_field import (
     NOTHING,
     PROBE_USABLE,
@@ -349,8 +357,9 @@ def view_probes(first: wp.int32, camera: CameraData, settings: PassSettings, fie
     if p[0] >= camera.width or p[1] >= camera.height:
         return
     pixel = p[1] * camera.width + p[0]
-    direction = primary_direction(camera, settings, p)
-    hit = march(field, camera.position, direction, 0.0, float(wp.inf), MOST_STEPS)
+    at = primary_sample(settings, p)
+    origin, direction = camera_origin(camera, at[0], at[1]), camera_ray(camera, at[0], at[1])
+    hit = march(field, origin, direction, 0.0, float(wp.inf), MOST_STEPS)
     position = wp.vec3(0.0, 0.0, 0.0)
     depth = float(wp.inf)
     reflected = wp.vec3(0.0, 0.0, 0.0)
@@ -363,7 +372,7 @@ def view_probes(first: wp.int32, camera: CameraData, settings: PassSettings, fie
         if hit.result != MISS:
             reflected = unpack_radiance(field.radiance[texel])
             emitted = texel_emission(field, texel)
-            position = camera.position + direction * hit.t
+            position = origin + direction * hit.t
             depth = wp.dot(position - camera.position, camera.forward)
             view.alpha[pixel] = view.alpha[pixel] + 1.0
             view.normal[pixel] = view.normal[pixel] + surfel_normal(surfel)

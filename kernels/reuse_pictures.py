@@ -9,7 +9,7 @@ import warp as wp
 from warp_gi.kernels.bsdf import luminance
 from warp_gi.kernels.bvh import bvh_intersect
 from warp_gi.kernels.environment import environment_radiance
-from warp_gi.kernels.gbuffer import CameraData, camera_ray
+from warp_gi.kernels.gbuffer import CameraData, camera_origin, camera_ray
 from warp_gi.kernels.octahedral import octahedral_decode, octahedral_encode
 from warp_gi.kernels.octree import Octree, cell_code, octree_leaf
 from warp_gi.kernels.parallax import seen_from_anchor
@@ -59,8 +59,10 @@ def view_leaves(first: wp.int32, scene: SceneData, camera: CameraData, begin: wp
     item = first + wp.tid()
     row = (begin + item) / camera.width
     column = begin + item - row * camera.width
-    direction = camera_ray(camera, wp.float32(column) + 0.5, wp.float32(row) + 0.5)
-    hit = bvh_intersect(scene.bvh, camera.position, direction, float(wp.inf))
+    x = wp.float32(column) + 0.5
+    y = wp.float32(row) + 0.5
+    direction = camera_ray(camera, x, y)
+    hit = bvh_intersect(scene.bvh, camera_origin(camera, x, y), direction, float(wp.inf))
     view.leaves[item] = -1
     if hit.face >= 0:
         s = surface_at(scene, hit.face, hit.u, hit.v, -direction)

@@ -16,7 +16,7 @@ from warp_gi.kernels.bsdf import Bsdf, diffuse_share, lambert
 from warp_gi.kernels.bvh import BvhHit, bvh_intersect
 from warp_gi.kernels.emitters import LightChoice, triangle_light_pdf
 from warp_gi.kernels.environment import environment_lookup, environment_sample
-from warp_gi.kernels.gbuffer import CameraData, camera_ray
+from warp_gi.kernels.gbuffer import CameraData, camera_origin, camera_ray
 from warp_gi.kernels.light_connections import connect_emitter, connect_sky, light_1d, light_2d
 from warp_gi.kernels.light_hierarchy import LightTree, hierarchy_light, hierarchy_light_pdf
 from warp_gi.kernels.ltc import LtcTable, lobe_albedo
@@ -222,8 +222,10 @@ def fill_cells(
     number = wp.int32(wp.int64(path) * wp.int64(settings.cameras.shape[0]) / wp.int64(settings.pass_paths))
     camera = settings.cameras[number]
     u = sample_2d(index, settings.seed, CAMERA_DIMENSION)
-    direction = camera_ray(camera, u[0] * wp.float32(camera.width), u[1] * wp.float32(camera.height))
-    hit = bvh_intersect(scene.bvh, camera.position, direction, float(wp.inf))
+    x = u[0] * wp.float32(camera.width)
+    y = u[1] * wp.float32(camera.height)
+    direction = camera_ray(camera, x, y)
+    hit = bvh_intersect(scene.bvh, camera_origin(camera, x, y), direction, float(wp.inf))
     met = int(0)
     while hit.face >= 0 and met < settings.vertices:
         s = surface_at(scene, hit.face, hit.u, hit.v, -direction)

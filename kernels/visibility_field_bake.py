@@ -10,7 +10,7 @@ around it hold the same single bit: few rays there find anything new, and only o
 import warp as wp
 
 from warp_gi.kernels.bvh import bvh_intersect
-from warp_gi.kernels.gbuffer import CameraData, camera_ray, tiled_pixel
+from warp_gi.kernels.gbuffer import CameraData, camera_origin, camera_ray, tiled_pixel
 from warp_gi.kernels.sampling import (
     SURFACE_PIECE_DIMENSION,
     SURFACE_POINT_DIMENSION,
@@ -267,8 +267,9 @@ def find_cells(
     y = 2 * p[1] + corner / 2
     if p[0] >= width or 2 * p[1] >= camera.height:
         return
-    direction = camera_ray(camera, wp.float32(x) + 0.5, wp.float32(y) + 0.5)
-    hit = bvh_intersect(scene.bvh, camera.position, direction, float(wp.inf))
+    at = wp.vec2(wp.float32(x) + 0.5, wp.float32(y) + 0.5)
+    direction = camera_ray(camera, at[0], at[1])
+    hit = bvh_intersect(scene.bvh, camera_origin(camera, at[0], at[1]), direction, float(wp.inf))
     cell = int(-1)
     if hit.face >= 0:
         s = surface_shape(scene, hit.face, hit.u, hit.v, -direction)

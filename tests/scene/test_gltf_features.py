@@ -369,6 +369,23 @@ def test_a_camera_that_is_a_reflection_is_left_out_with_a_line(tmp_path):
         assert not loaded(glb, tmp_path).cameras
 
 
-def test_an_orthographic_camera_is_named():
-    with pytest.warns(gi.UnsupportedWarning, match=r"orthographic cameras \(camera 0\)"):
-        assert not gi.load_scene(CASES / "gltf-camera-aspect" / "ortho.glb").cameras
+def test_an_orthographic_camera_shows_its_xmag_and_ymag():
+    (camera,) = gi.load_scene(CASES / "gltf-camera-aspect" / "ortho.glb").cameras.values()
+    assert camera.ortho_width == 2.0 and camera.resolution[0] == camera.resolution[1]
+    assert camera.half_size == (1.0, 1.0)
+    grown = gi.load_scene(CASES / "gltf-camera-aspect" / "ortho.glb", scale=3.0)
+    assert next(iter(grown.cameras.values())).ortho_width == 6.0
+    beauty = picture(gi.load_scene(CASES / "gltf-camera-aspect" / "ortho.glb"), camera.at_resolution(8, 8)).numpy(
+        "beauty"
+    )
+    np.testing.assert_allclose(beauty, 0.5, atol=1e-3)  # its square fills the picture, at any distance
+
+
+@pytest.mark.parametrize(("xmag", "what"), [(0.0, "above 0, got 0 and 1"), (-2.0, "above 0, got -2 and 1")])
+def test_an_orthographic_camera_without_a_size_is_left_out_with_a_line(tmp_path, xmag, what):
+    glb = square()
+    lens = {"xmag": xmag, "ymag": 1.0, "znear": 0.0, "zfar": 9.0}
+    glb.add("nodes", {"camera": glb.add("cameras", {"type": "orthographic", "orthographic": lens})})
+    glb.json["scenes"] = [{"nodes": [0, 1]}]
+    with pytest.warns(UserWarning, match=f"{what}; it is left out"):
+        assert not loaded(glb, tmp_path).cameras

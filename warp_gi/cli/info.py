@@ -54,10 +54,10 @@ def main(arguments: Sequence[str]) -> int:
                     name,
                     _numbers(camera.position + camera.offset),
                     _numbers(-camera.world_from_camera[:3, 2]),
-                    camera.hfov,
+                    f"{camera.ortho_width:g} m" if camera.is_orthographic else f"{camera.hfov:.4g}°",
                 )
             )
-        print_table("cameras", ("name", "position [m]", "direction", "hfov [deg]"), rows)
+        print_table("cameras", ("name", "position [m]", "direction", "hfov or width"), rows)
     return 0
 
 

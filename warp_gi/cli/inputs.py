@@ -64,6 +64,8 @@ class SceneOptions:
     """Horizontal field of view of a still camera in degrees."""
     vfov: Annotated[float | None, flag("DEGREES", "as --hfov and the resolution say")] = None
     """Vertical field of view of a still camera in degrees, in place of --hfov."""
+    ortho: Annotated[float | None, flag("METRES", "a perspective camera, or as the file has it")] = None
+    """Width in metres of what a still camera shows by parallel rays (orthographic), in place of --hfov."""
 
 
 def open_scene(
@@ -145,6 +147,14 @@ def find_camera(options: SceneOptions, scene: Scene | BakedScene, report: Report
         if isinstance(camera, CameraPath):
             raise OptionError("--vfov goes with a still camera; a camera path has its own field of view")
         camera = camera.with_vfov(options.vfov)
+    if options.ortho is not None:
+        if options.hfov is not None or options.vfov is not None:
+            raise OptionError("--ortho goes without --hfov and --vfov: parallel rays have no field of view")
+        if not (options.ortho > 0 and math.isfinite(options.ortho)):
+            raise OptionError(f"--ortho must be a width above 0 m, got {options.ortho:g}")
+        if isinstance(camera, CameraPath):
+            raise OptionError("--ortho goes with a still camera; keyframes of a camera path have ortho_width")
+        camera = replace(camera, ortho_width=options.ortho, keeps_vertical=False)
     return camera.relative_to(scene.offset)
 
 

@@ -48,13 +48,15 @@ class CameraKey:
     """Width of a pixel by its height."""
     keeps_vertical: bool = False
     """Whether the vertical field of view, and not the horizontal one, stays at another resolution."""
+    ortho_width: float = 0.0
+    """Width in metres of what an orthographic camera shows; 0 is a perspective camera."""
 
 
 @dataclass(frozen=True)
 class CameraPath:
     """Keyframes in time; eye, target, up and lens follow cubic Hermite curves through the keys.
 
-    Raises OptionError without keys, or with times that do not rise.
+    Raises OptionError without keys, with times that do not rise, or with perspective and orthographic keys.
     """
 
     keys: tuple[CameraKey, ...]
@@ -77,6 +79,8 @@ class CameraPath:
         if not (all(math.isfinite(key.time) for key in self.keys) and self.keys[-1].time >= 0):
             times = [key.time for key in self.keys]
             raise OptionError(f"keyframe times of a camera path must be finite and end at 0 s or later, got {times}")
+        if len({key.ortho_width > 0 for key in self.keys}) > 1:
+            raise OptionError("the keyframes of a camera path must be all perspective or all orthographic")
         if not (self.fps > 0 and math.isfinite(self.fps)):
             raise OptionError(f"fps must be finite and above 0, got {self.fps}")
 
@@ -91,14 +95,15 @@ class CameraPath:
 
     def camera_at(self, time: float) -> Camera:
         """Return the camera at a time in seconds, held before the first and after the last key."""
-        lenses = ([k.hfov, *k.lens_shift, k.pixel_aspect] for k in self.keys)
+        lenses = ([k.hfov, *k.lens_shift, k.pixel_aspect, k.ortho_width] for k in self.keys)
         rows = np.array(
             [[*k.eye, *k.target, *k.up, *lens] for k, lens in zip(self.keys, lenses, strict=True)], np.float64
         )
         pose = _hermite(np.array([k.time for k in self.keys]), rows, time)
         camera = Camera.look_at(pose[0:3], pose[3:6], pose[6:9], float(pose[9]), self.resolution, self.name)
-        right, above, pixel_aspect = pose[10:].tolist()
-        return replace(camera, offset=self.offset, lens_shift=(right, above), pixel_aspect=pixel_aspect)
+        right, above, pixel_aspect, width = pose[10:].tolist()
+        shift = right, above
+        return replace(camera, offset=self.offset, lens_shift=shift, pixel_aspect=pixel_aspect, ortho_width=width)
 
     def relative_to(self, offset: Sequence[float] | np.ndarray) -> CameraPath:
         """Return the same path, counted from another point of the file's coordinates (as of ``Scene.offset``)."""
@@ -135,7 +140,7 @@ class CameraPath:
         for camera, time in zip(cameras, times, strict=True):
             matrix = camera.relative_to(offset).world_from_camera
             target = matrix[:3, 3] - matrix[:3, 2]
-            lens = camera.hfov, camera.lens_shift, camera.pixel_aspect, camera.keeps_vertical
+            lens = camera.hfov, camera.lens_shift, camera.pixel_aspect, camera.keeps_vertical, camera.ortho_width
             keys.append(CameraKey(time, _three(matrix[:3, 3]), _three(target), _three(matrix[:3, 1]), *lens))
         return cls(tuple(keys), fps, cameras[0].resolution if cameras else (960, 540), offset=offset)
 
@@ -199,7 +204,8 @@ class CameraPath:
 
         ``{"fps": 24, "resolution": [960, 540], "keyframes": [{"time": 0, "eye": [x, y, z],
         "target": [x, y, z], "up": [0, 1, 0], "hfov": 65}, ...]}``; up, hfov, fps and resolution may be left out. A
-        keyframe may have "vfov" in place of hfov, "lens_shift" and "pixel_aspect"; or "K", which needs the resolution.
+        keyframe may have "vfov" or "ortho_width" in place of hfov, "lens_shift" and "pixel_aspect"; or "K", which needs
+        the resolution.
         In place of eye and target it may have "world_from_camera" and "convention", as ``Camera.from_intrinsics``.
         Raises SceneError when the file is missing or not such a path.
         """
@@ -231,7 +237,10 @@ class CameraPath:
             }
             if k.lens_shift != (0.0, 0.0) or k.pixel_aspect != 1.0:
                 key |= {"lens_shift": list(k.lens_shift), "pixel_aspect": k.pixel_aspect}
-            if k.keeps_vertical:
+            if k.ortho_width:
+                key["ortho_width"] = k.ortho_width
+                del key["hfov"]
+            elif k.keeps_vertical:
                 lens = Camera(np.eye(4), k.hfov, self.resolution, pixel_aspect=k.pixel_aspect)
                 key["vfov"] = lens.vfov
                 del key["hfov"]
@@ -277,6 +286,6 @@ def views_hash(camera: Camera | CameraPath | None) -> str:
         views = [camera.camera(index) for index in range(camera.frame_count)]
     for one in views:
         digest.update(one.world_from_camera.tobytes())
-        lens = (one.hfov, *one.resolution, *one.lens_shift, one.pixel_aspect)
+        lens = (one.hfov, *one.resolution, *one.lens_shift, one.pixel_aspect, one.ortho_width)
         digest.update(np.array(lens, np.float64).tobytes())
     return digest.hexdigest()

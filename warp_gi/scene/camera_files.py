@@ -163,7 +163,10 @@ def _camera(key: _Fields, resolution: tuple[int, int]) -> Camera:
         resolution=resolution,
         lens_shift=(right, above),
         pixel_aspect=key.number("pixel_aspect", 1.0),
+        ortho_width=key.number("ortho_width", 0.0),
     )
+    if camera.is_orthographic and ("vfov" in key or "hfov" in key):
+        raise ValueError(f"{key.what} has ortho_width and a field of view; leave one out")
     if "vfov" in key and "hfov" in key:
         raise ValueError(f"{key.what} has both hfov and vfov; leave one out")
     return camera.with_vfov(key.number("vfov")) if "vfov" in key else camera
@@ -204,7 +207,7 @@ def _transforms(document: Mapping[str, Any], path: Path) -> CameraFile:
 
 
 def _size(values: _Fields) -> tuple[int, int]:
-    """Return width and height of a frame. What is given in pixels has no meaning without them."""
+    """Return width and height of a frame. What is given in pixels, or across alone, has no meaning without them."""
     lacking = [side for side in ("w", "h") if side not in values]
     given = [name for name in ("fl_x", "fl_y", "cx", "cy", "w", "h") if name in values]
     if lacking and given:

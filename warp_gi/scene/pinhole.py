@@ -1,4 +1,4 @@
-"""Pinhole cameras."""
+"""Perspective (pinhole) and orthographic cameras."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LARGEST_COUNT = 1 << 30  # pixels; kernels count them in int32
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera. It looks along -z of its own space, x is right and y up in the picture.
+    """A perspective (pinhole) or orthographic camera. It looks along -z of its own space, x is right and y up.
 
     It has no depth of field and no lens distortion. Raises OptionError for a field of view outside (0, 180) degrees,
     an empty resolution, or a matrix that is singular, reflected or not finite.
@@ -33,7 +33,7 @@ class Camera:
     world_from_camera: np.ndarray
     """Placement, float64 [4, 4], acting on column vectors; its axes are made orthonormal."""
     hfov: float = 65.0
-    """Horizontal field of view in degrees."""
+    """Horizontal field of view in degrees; of no meaning in an orthographic camera."""
     resolution: tuple[int, int] = (960, 540)
     """Width and height in pixels."""
     name: str = ""
@@ -46,6 +46,8 @@ class Camera:
     """Whether the vertical field of view, and not the horizontal one, stays at another resolution."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Point in metres of a file's coordinates that ``world_from_camera`` counts from: that of a recentred scene."""
+    ortho_width: float = 0.0
+    """Width in metres of what an orthographic camera shows; 0 is a perspective camera. See ``orthographic``."""
 
     def __post_init__(self) -> None:
         try:
@@ -77,6 +79,9 @@ class Camera:
             raise OptionError(f"camera {self.name!r}: hfov must be between 0 and 180 degrees, got {self.hfov}")
         if not (self.pixel_aspect > 0 and math.isfinite(self.pixel_aspect)):
             raise OptionError(f"camera {self.name!r}: pixel_aspect must be finite and above 0, got {self.pixel_aspect}")
+        check_number(f"camera {self.name!r}: ortho_width", self.ortho_width)
+        if not (self.ortho_width >= 0 and math.isfinite(self.ortho_width)):
+            raise OptionError(f"camera {self.name!r}: ortho_width must be finite and from 0 up, got {self.ortho_width}")
         if np.shape(self.lens_shift) != (2,):
             raise OptionError(f"camera {self.name!r}: lens_shift must be two finite numbers, got {self.lens_shift!r}")
         for shift in self.lens_shift:
@@ -115,6 +120,27 @@ class Camera:
         """
         camera = cls(_look_at_matrix(eye, target, up), hfov, resolution, name, lens_shift)
         return camera if vfov is None else camera.with_vfov(vfov)
+
+    @classmethod
+    def orthographic(
+        cls,
+        eye: Vector,
+        target: Vector,
+        up: Vector = (0.0, 1.0, 0.0),
+        width: float = 2.0,
+        resolution: tuple[int, int] = (960, 540),
+        name: str = "",
+    ) -> Camera:
+        """Return an orthographic camera, whose rays are parallel.
+
+        It shows ``width`` [m] across, and as much downwards as the resolution says. ``eye`` [m] and ``target`` [m] are
+        in the middle of the picture; what is behind the plane through ``eye`` is not seen. Raises OptionError as
+        ``look_at``, and for a width that is not above 0.
+        """
+        check_number(f"camera {name!r}: width", width)
+        if not width > 0:
+            raise OptionError(f"camera {name!r}: width of an orthographic camera must be above 0 m, got {width}")
+        return cls(_look_at_matrix(eye, target, up), resolution=resolution, name=name, ortho_width=width)
 
     @classmethod
     def from_intrinsics(
@@ -162,6 +188,8 @@ class Camera:
 
     def with_vfov(self, vfov: float) -> Camera:
         """Return the same camera with a vertical field of view in degrees, which stays at another resolution."""
+        if self.is_orthographic:
+            raise OptionError(f"camera {self.name!r} is orthographic: it has a width in metres, and no field of view")
         if not 0.0 < vfov < 180.0:
             raise OptionError(f"camera {self.name!r}: vfov must be between 0 and 180 degrees, got {vfov}")
         width, height = self.resolution
@@ -172,35 +200,44 @@ class Camera:
         """Return the same camera with another resolution; see ``keeps_vertical`` for another shape."""
         camera = replace(self, resolution=(width, height))
         is_alike = width * self.resolution[1] == height * self.resolution[0]
-        return camera if is_alike or not self.keeps_vertical else camera.with_vfov(self.vfov)
+        is_kept = is_alike or not self.keeps_vertical or self.is_orthographic
+        return camera if is_kept else camera.with_vfov(self.vfov)
+
+    @property
+    def is_orthographic(self) -> bool:
+        """Whether the camera's rays are parallel."""
+        return self.ortho_width > 0
 
     @property
     def vfov(self) -> float:
-        """Vertical field of view in degrees."""
-        return 2 * math.degrees(math.atan(self._halves[1]))
+        """Vertical field of view in degrees; of no meaning in an orthographic camera."""
+        return 2 * math.degrees(math.atan(self.half_size[1])) if not self.is_orthographic else self.hfov
 
     @property
     def intrinsics(self) -> np.ndarray:
-        """``K`` of ``from_intrinsics``, float64 [3, 3]: focal lengths and principal point in pixels."""
-        (width, height), (across, up), (right, above) = self.resolution, self._halves, self.lens_shift
+        """``K`` of ``from_intrinsics``, float64 [3, 3]: focal lengths and principal point in pixels.
+
+        Of an orthographic camera it has pixels a metre in place of focal lengths.
+        """
+        (width, height), (across, up), (right, above) = self.resolution, self.half_size, self.lens_shift
         fx, fy = 0.5 * width / across, 0.5 * height / up
         return np.array([[fx, 0.0, (0.5 - right) * width], [0.0, fy, (0.5 + above) * height], [0.0, 0.0, 1.0]])
 
     @property
     def lens(self) -> tuple[object, ...]:
         """All that decides a picture beside the placement, to compare cameras by."""
-        return self.hfov, self.resolution, self.lens_shift, self.pixel_aspect
+        return self.hfov, self.resolution, self.lens_shift, self.pixel_aspect, self.ortho_width
 
     @property
     def footprint(self) -> float:
-        """Longer side of a pixel in metres, at 1 m along the view axis."""
-        return 2.0 * self._halves[0] / self.resolution[0] * max(1.0, 1.0 / self.pixel_aspect)
+        """Longer side of a pixel in metres, at 1 m along the view axis; at any distance of an orthographic camera."""
+        return 2.0 * self.half_size[0] / self.resolution[0] * max(1.0, 1.0 / self.pixel_aspect)
 
     @property
-    def _halves(self) -> tuple[float, float]:
-        """Half the width and half the height of the picture at 1 m along the view axis, in metres."""
+    def half_size(self) -> tuple[float, float]:
+        """Half the width and half the height in metres of what is seen at 1 m along the view axis."""
         width, height = self.resolution
-        half = math.tan(math.radians(self.hfov) / 2)
+        half = self.ortho_width / 2 if self.is_orthographic else math.tan(math.radians(self.hfov) / 2)
         return half, half * height / width / self.pixel_aspect
 
     def relative_to(self, offset: Vector) -> Camera:
@@ -220,14 +257,24 @@ class Camera:
         """Return unit vectors float64 [n, 3] from the camera through pixel coordinates [n, 2], as of ``project``."""
         (fx, _, cx), (_, fy, cy), _ = self.intrinsics
         x, y = np.moveaxis((np.asarray(pixels, dtype=np.float64) - (cx, cy)) / (fx, fy), -1, 0)
+        if self.is_orthographic:
+            x, y = np.zeros_like(x), np.zeros_like(y)
         ways = np.stack([x, -y, np.full_like(x, -1.0)], axis=-1) @ self.world_from_camera[:3, :3].T
         return ways / np.linalg.norm(ways, axis=-1, keepdims=True)
+
+    def origins(self, pixels: np.ndarray) -> np.ndarray:
+        """Return where rays through pixel coordinates [n, 2] begin, float64 [n, 3]: all at the eye, or on its plane."""
+        (fx, _, cx), (_, fy, cy), _ = self.intrinsics
+        x, y = np.moveaxis((np.asarray(pixels, dtype=np.float64) - (cx, cy)) / (fx, fy), -1, 0)
+        local = np.stack([x, -y, np.zeros_like(x)], axis=-1) * self.is_orthographic
+        return self.position + local @ self.world_from_camera[:3, :3].T
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Return pixel coordinates float64 [n, 2] of ``points`` [n, 3]; (0, 0) is the top left corner."""
         local = (np.asarray(points, dtype=np.float64) - self.position) @ self.world_from_camera[:3, :3]
         (fx, _, cx), (_, fy, cy), _ = self.intrinsics
-        return local[:, :2] / -local[:, 2:] * [fx, -fy] + np.array([cx, cy])
+        depth = np.ones((len(local), 1)) if self.is_orthographic else -local[:, 2:]
+        return local[:, :2] / depth * [fx, -fy] + np.array([cx, cy])
 
 
 def offset_text(offset: Vector) -> str:
@@ -256,12 +303,13 @@ def camera_data(camera: Camera) -> gbuffer.CameraData:
     """Return the camera as kernels read it."""
     right, up, back = camera.world_from_camera[:3, :3].T
     width, height = camera.resolution
-    half = math.tan(math.radians(camera.hfov) / 2)
+    half, half_height = camera.half_size
     data = gbuffer.CameraData()
     data.position = wp.vec3(*camera.position)
     data.right = wp.vec3(*(right * half))
-    data.up = wp.vec3(*(up * half * height / width / camera.pixel_aspect))
+    data.up = wp.vec3(*(up * half_height))
     data.forward = wp.vec3(*-back)
+    data.spread = 0.0 if camera.is_orthographic else 1.0
     data.center = wp.vec2(*(2.0 * shift for shift in camera.lens_shift))
     data.width, data.height = width, height
     return data

@@ -8,7 +8,6 @@ write equal files, except for the stage times.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -130,14 +129,15 @@ def frame_attributes(
 ) -> dict[str, Attribute]:
     """Return the EXR attributes of a frame, all but its stage times.
 
-    ``screenWindowCenter``, ``screenWindowWidth`` and ``pixelAspectRatio`` are OpenEXR's, at 1 m before the camera;
+    ``screenWindowCenter``, ``screenWindowWidth`` and ``pixelAspectRatio`` are OpenEXR's, at 1 m before the camera, and
+    the picture's size in metres where ``warp_gi/projection`` says "orthographic", whose ``hfov`` has no meaning;
     ``K`` is that of ``Camera.from_intrinsics``, row after row. ``worldToCamera`` and ``worldToNDC`` follow the OpenEXR
     standard: row vectors, a left-handed camera space with x right, y up and z forward; NDC from (0, 0) at the upper
     left to (1, 1) at the lower right corner of the picture. ``warp_gi/offset`` is what a recentred scene's positions,
     and these matrices, are without: "x y z" in metres of the file's coordinates.
     """
     world_to_camera, world_to_ndc = camera_matrices(camera)
-    half_width, half_height = (math.tan(math.radians(angle) / 2) for angle in (camera.hfov, camera.vfov))
+    half_width, half_height = camera.half_size
     attributes: dict[str, Attribute] = {
         "frame": int(index),
         "time": float(time),
@@ -150,6 +150,8 @@ def frame_attributes(
         "screenWindowCenter": 2 * np.multiply(camera.lens_shift, (half_width, half_height)),
         PREFIX + "precision": precision,
     }
+    if camera.is_orthographic:
+        attributes |= {PREFIX + "projection": "orthographic"}
     if any(camera.offset):
         attributes[PREFIX + "offset"] = offset_text(camera.offset)
     if previous_camera is not None:  # motion is towards it
@@ -164,9 +166,13 @@ def camera_matrices(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Return ``worldToCamera`` and ``worldToNDC`` as OpenEXR defines them, float32 [4, 4], for row vectors."""
     forward_z = np.diag([1.0, 1.0, -1.0, 1.0])
     camera_from_world = forward_z @ np.linalg.inv(camera.world_from_camera)
-    # x / z and y / z on the picture; the third column only keeps the matrix invertible
+    # x / z and y / z on the picture (x and y of an orthographic camera); the third row keeps the matrix invertible
     (x, _, right), (_, y, down), _ = camera.intrinsics / np.array([*camera.resolution, 1])[:, None]
-    ndc_from_camera = np.array([[x, 0, right, 0], [0, -y, down, 0], [0, 0, 1, -1], [0, 0, 1, 0]], np.float64)
+    if camera.is_orthographic:
+        rows = [[x, 0, 0, right], [0, -y, 0, down], [0, 0, 1, 0], [0, 0, 0, 1]]
+    else:
+        rows = [[x, 0, right, 0], [0, -y, down, 0], [0, 0, 1, -1], [0, 0, 1, 0]]
+    ndc_from_camera = np.array(rows, np.float64)
     return camera_from_world.T.astype(np.float32), (ndc_from_camera @ camera_from_world).T.astype(np.float32)
 
 
@@ -223,6 +229,8 @@ def read_frame(path: str | Path) -> FrameFile:
         if isinstance(K := attributes.get("K"), np.ndarray):
             shift = (0.5 - float(K[0, 2]) / width, float(K[1, 2]) / height - 0.5)
             camera = replace(camera, lens_shift=shift, pixel_aspect=float(attributes["pixelAspectRatio"]))
+        if metadata.get("projection") == "orthographic":
+            camera = replace(camera, ortho_width=float(attributes["screenWindowWidth"]))
     return FrameFile(
         buffers,
         formats,

@@ -173,19 +173,21 @@ class _Reader:
         source = document.item("cameras", index, owner)
         what = document.name("cameras", index)
         lens = document.part(source, "perspective", what)
-        if lens is None:
-            if source.get("type") == "orthographic" or "orthographic" in source:
-                document.findings.add("orthographic cameras", what)
-            else:
-                document.findings.lost.append(f"{str(self.path)!r}: {what} has no perspective lens; it is left out")
-            return None
-        aspect = document.number(lens, "aspectRatio", what, 16.0 / 9.0)
-        vfov = document.number(lens, "yfov", what)
-        hfov = 2.0 * math.degrees(math.atan(math.tan(vfov / 2.0) * aspect))
-        resolution = (max(1, round(CAMERA_HEIGHT * aspect)), CAMERA_HEIGHT)
+        parallel = document.part(source, "orthographic", what)
         name = document.text(source, "name") or node
         try:
-            return Camera(world_from_node, hfov, resolution, name, keeps_vertical=lens.get("aspectRatio") is None)
+            if parallel is not None and (lens is None or source.get("type") == "orthographic"):
+                across, up = (document.number(parallel, mag, what) for mag in ("xmag", "ymag"))
+                if not (across > 0 and up > 0):
+                    raise OptionError(f"{what} must have xmag and ymag above 0, got {across:g} and {up:g}")
+                return Camera(world_from_node, resolution=_shape(across / up), name=name, ortho_width=2 * across)
+            if lens is None:
+                raise OptionError(f"{what} has neither a perspective nor an orthographic lens")
+            aspect = document.number(lens, "aspectRatio", what, 16.0 / 9.0)
+            vfov = document.number(lens, "yfov", what)
+            hfov = 2.0 * math.degrees(math.atan(math.tan(vfov / 2.0) * aspect))
+            is_free = lens.get("aspectRatio") is None
+            return Camera(world_from_node, hfov, _shape(aspect), name, keeps_vertical=is_free)
         except OptionError as error:
             document.findings.lost.append(f"{str(self.path)!r}: {error}; it is left out")
             return None
@@ -221,6 +223,11 @@ class _Names:
             result = f"{name} {self.taken[name]}"
         self.taken[result] = 1
         return result
+
+
+def _shape(aspect: float) -> tuple[int, int]:
+    """Return a resolution of so many times its height across."""
+    return max(1, round(CAMERA_HEIGHT * aspect)), CAMERA_HEIGHT
 
 
 def _placed(light: PunctualLight, world_from_node: np.ndarray) -> PunctualLight:

@@ -129,7 +129,8 @@ class SceneParts:
 
         def scaled_camera(camera: Camera) -> Camera:
             offset = tuple(scale * np.array(camera.offset))
-            return replace(camera, world_from_camera=grow @ camera.world_from_camera, offset=offset)
+            width = scale * camera.ortho_width
+            return replace(camera, world_from_camera=grow @ camera.world_from_camera, offset=offset, ortho_width=width)
 
         return SceneParts(
             [scaled_node(node) for node in self.nodes],

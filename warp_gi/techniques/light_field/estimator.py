@@ -24,7 +24,7 @@ from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.techniques.light_field.settings import ProbeSettings
 from warp_gi.techniques.light_field.state import ProbeState, path_settings, sky_bytes
 from warp_gi.techniques.shared.lamps import lit_data
-from warp_gi.techniques.shared.views import camera_rows, cameras_of
+from warp_gi.techniques.shared.views import camera_rows, cameras_of, known_rows
 
 if TYPE_CHECKING:
     import warp as wp
@@ -198,7 +198,7 @@ class LightFieldProbes(Estimator, RadianceCache):
             raise BakeError(
                 "this bake of probes is by an earlier version, whose rough surfaces were too bright: bake it again"
             )
-        made_for, wanted = bake.arrays["cameras"], camera_rows(cameras_of(camera))
+        made_for, wanted = known_rows(bake.arrays["cameras"]), camera_rows(cameras_of(camera))
         known = (
             np.abs(wanted[:, None] - made_for).max(axis=2)
             <= SAME_VIEW * np.maximum(np.abs(wanted).max(axis=1), 1)[:, None]

@@ -190,14 +190,15 @@ def draw_places(frame: Frame, state: ProbeState) -> np.ndarray:
     near = away > 1e-3 * max(float(np.abs(away).max()), 1e-9)
     at = camera.project(np.where(near[:, None], positions, camera.position - camera.world_from_camera[:3, 2]))
     inside = near & (at >= 0).all(1) & (at < (width, height)).all(1)
-    focal = 0.5 * width / math.tan(math.radians(camera.hfov) / 2)
+    focal = camera.intrinsics[0, 0]
+    scale = np.ones_like(away) if camera.is_orthographic else away
     size = 0.07 * float(np.min(state.grid.spacing))  # metres
     canvas = Image.new("RGBA", (width * _SMOOTH, height * _SMOOTH))
     draw = ImageDraw.Draw(canvas)
     font = label_font(12 * _SMOOTH)
     for probe in sorted(np.flatnonzero(inside), key=lambda i: -away[i]):
         x, y = at[probe] * _SMOOTH
-        r = float(np.clip(size * focal / away[probe], max(width / 160, 4), max(width / 45, 8))) * _SMOOTH
+        r = float(np.clip(size * focal / scale[probe], max(width / 160, 4), max(width / 45, 8))) * _SMOOTH
         color = probe_color(int(probe))
         box = (x - r, y - r, x + r, y + r)
         if away[probe] > depth[int(at[probe, 1]), int(at[probe, 0])] * 1.001:
@@ -256,13 +257,14 @@ def draw_seen(frame: Frame, state: ProbeState, visibility: Literal["probes", "ex
 def _reflected_ray(frame: Frame, column: int, row: int) -> tuple[np.ndarray, np.ndarray]:
     """Return origin [m] and unit direction, each float64 [3], of a pixel's ray after its reflection, if it hits."""
     camera = frame.camera
-    (direction,) = camera.directions(np.array([(column + 0.5, row + 0.5)]))
+    pixel = np.array([(column + 0.5, row + 0.5)])
+    (direction,), (origin,) = camera.directions(pixel), camera.origins(pixel)
     normal = frame.numpy("normal")[row, column].astype(np.float64)
     length = np.linalg.norm(normal)  # below 1 where samples of a pixel differ
     if length == 0 or not np.isfinite(frame.numpy("depth")[row, column]):
-        return camera.position, direction
+        return origin, direction
     position, normal = frame.numpy("position")[row, column].astype(np.float64), normal / length
-    distance = np.linalg.norm(position - camera.position)
+    distance = np.linalg.norm(position - origin)
     return position + 1e-4 * distance * normal, direction - 2 * (direction @ normal) * normal
 
 

@@ -8,6 +8,10 @@ import numpy as np
 
 from warp_gi.scene.camera import Camera, CameraPath
 
+ROW = 17
+"""Numbers of a row of ``camera_rows``."""
+PLAIN_LENS = (0.0, 0.0, 1.0, 0.0)
+"""The last numbers of the row of a perspective camera without a lens shift and with square pixels."""
 SPREAD = 32
 """Largest number of frames of a path that stand for all of it."""
 
@@ -23,7 +27,23 @@ def cameras_of(camera: Camera | CameraPath | None, every: bool = False) -> list[
     return [camera.camera(int(frame)) for frame in np.unique(np.round(frames))]
 
 
+def known_rows(rows: np.ndarray) -> np.ndarray:
+    """Return rows of ``camera_rows`` of a bake; those of earlier versions have no lens but a field of view."""
+    if rows.shape[1] != ROW - len(PLAIN_LENS):
+        return rows
+    return np.concatenate([rows, np.tile(np.array(PLAIN_LENS, np.float32), (len(rows), 1))], axis=1)
+
+
 def camera_rows(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return placement and field of view of cameras, float32 [camera, 13], but not the shape of their pictures."""
-    rows = [[*camera.world_from_camera[:3].ravel(), camera.hfov] for camera in cameras]
-    return np.array(rows, np.float32).reshape(-1, 13)
+    """Return placement and lens of cameras, float32 [camera, 17], but not the shape of their pictures."""
+    rows = [
+        [
+            *camera.world_from_camera[:3].ravel(),
+            camera.hfov,
+            *camera.lens_shift,
+            camera.pixel_aspect,
+            camera.ortho_width,
+        ]
+        for camera in cameras
+    ]
+    return np.array(rows, np.float32).reshape(-1, ROW)

@@ -18,7 +18,7 @@ from warp_gi.kernels.surface_cache_fill import fill_cells
 from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import whole_scene
 from warp_gi.stateful import Ahead
-from warp_gi.techniques.shared.views import camera_rows, cameras_of
+from warp_gi.techniques.shared.views import ROW, camera_rows, cameras_of, known_rows
 from warp_gi.techniques.surface_cache.cells import NOTHING, with_table
 from warp_gi.techniques.surface_cache.fill import FillSettings, camera_boxes, empty_grid, fill, grid_at, tell_over
 from warp_gi.techniques.surface_cache.state import CacheState, Refresh, followed, is_moving
@@ -38,7 +38,7 @@ SAME_VIEW = 1e-4
 """Largest relative difference between a number of a camera and that of a bake's camera for the two to be the same."""
 SAME_PLACE = 0.01
 """The same of its position, in sides of the smallest cell; below that cells cannot tell."""
-POSITION = np.isin(np.arange(13), (3, 7, 11))
+POSITION = np.isin(np.arange(ROW), (3, 7, 11))
 """Which numbers of a row of ``camera_rows`` are the position: the last column of three rows of a matrix."""
 
 
@@ -134,7 +134,7 @@ class SurfaceCache(RadianceCache):
                 "a surface cache is filled from where the scene is seen, and no camera is known: give a camera"
             )
         settings, target = self.fill_settings, launch.get_device(device)
-        boxes = camera_boxes(cameras)
+        boxes = camera_boxes(cameras, scene)
         grid, sums, vertices = empty_grid(scene, settings, boxes, target), NOTHING, 0
         if not is_moving(scene):
             sums, vertices = fill(scene, settings, grid, cameras, target, seed, progress)
@@ -162,7 +162,7 @@ class SurfaceCache(RadianceCache):
         Raises BakeError for arrays that do not fit together.
         """
         _check_arrays(bake)
-        made_for, wanted = bake.arrays["cameras"], camera_rows(cameras_of(camera))
+        made_for, wanted = known_rows(bake.arrays["cameras"]), camera_rows(cameras_of(camera))
         apart = np.abs(wanted[:, None] - made_for)
         turned = SAME_VIEW * np.maximum(np.abs(wanted[:, ~POSITION]).max(axis=1, keepdims=True), 1)
         rounding = 2 * np.finfo(np.float32).eps * np.abs(wanted[:, POSITION]).max(axis=1, keepdims=True)
@@ -231,8 +231,9 @@ def _check_arrays(bake: Bake) -> None:
 
 def _is_whole(arrays: dict[str, np.ndarray]) -> bool:
     """Return whether arrays have their shapes and types, keys are in order, and all else is finite."""
-    if any(np.ndim(arrays.get(name, 0)) == 0 for name in ("keys", "boxes", "cameras")):
+    if any(np.ndim(arrays.get(name, 0)) == 0 for name in ("keys", "boxes")) or np.ndim(arrays.get("cameras", 0)) != 2:
         return False
+    arrays = arrays | {"cameras": known_rows(arrays["cameras"])}
     count = len(arrays["keys"])
     wanted = {
         "keys": (np.uint64, (count,)),
@@ -240,7 +241,7 @@ def _is_whole(arrays: dict[str, np.ndarray]) -> bool:
         "low": (np.float32, (3,)),
         "side": (np.float32, (1,)),
         "boxes": (np.float32, (len(arrays["boxes"]), 2, 3)),
-        "cameras": (np.float32, (len(arrays["cameras"]), len(POSITION))),
+        "cameras": (np.float32, (len(arrays["cameras"]), ROW)),
     }
     has_shape = all(
         name in arrays and arrays[name].dtype == dtype and arrays[name].shape == shape

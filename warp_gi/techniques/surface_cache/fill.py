@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 
 import numpy as np
 import warp as wp
@@ -210,8 +211,27 @@ def object_grids(scene: Scene, time: float, device: wp.Device) -> wp.array:
     return launch.on_device(rows, ObjectGrid, device)
 
 
-def camera_boxes(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return boxes around the positions of cameras, float32 [box, 2, 3] in metres, each of a piece of their path."""
-    positions = np.array([camera.position for camera in cameras], np.float32)
-    pieces = np.array_split(positions, min(len(positions), MOST_BOXES))
+def camera_boxes(cameras: Sequence[Camera], scene: Scene) -> np.ndarray:
+    """Return boxes around the positions of cameras, float32 [box, 2, 3] in metres, each of a piece of their path.
+
+    Those of orthographic cameras hold all that is seen of the scene: it is as large in the picture wherever it is.
+    """
+    places = [_places(camera, scene) for camera in cameras]
+    pieces = [np.concatenate(places[piece[0] : piece[-1] + 1]) for piece in _pieces(len(places))]
     return np.unique(np.array([[piece.min(axis=0), piece.max(axis=0)] for piece in pieces]), axis=0)
+
+
+def _pieces(count: int) -> list[np.ndarray]:
+    return np.array_split(np.arange(count), min(count, MOST_BOXES))
+
+
+def _places(camera: Camera, scene: Scene) -> np.ndarray:
+    """Return the camera's position, or the corners of what an orthographic camera sees; float32 [n, 3] in metres."""
+    if not camera.is_orthographic:
+        return np.array([camera.position], np.float32)
+    width, height = camera.resolution
+    near = camera.origins(np.array([(x, y) for x in (0, width) for y in (0, height)]))
+    ahead = -camera.world_from_camera[:3, 2]
+    corners = np.array(list(product(*scene.bounds.astype(np.float64).T)))
+    reach = max(float(((corners - camera.position) @ ahead).max()), 0.0)
+    return np.concatenate([near, near + reach * ahead]).astype(np.float32)

@@ -48,8 +48,8 @@ def traced_seconds(scene: Scene, device: wp.Device, camera: Camera, rays: float,
     """Return the CPU seconds in which a frame traces ``rays`` rays a pixel from what it sees into the hemisphere."""
     rng, bvh = np.random.default_rng(seed), scene.bvh(device)
     width, height = camera.resolution
-    ways = camera.directions(rng.uniform(size=(TRIED_RAYS, 2)) * (width, height)).astype(np.float32)
-    origins = np.broadcast_to(camera.world_from_camera[:3, 3], ways.shape).astype(np.float32)
+    pixels = rng.uniform(size=(TRIED_RAYS, 2)) * (width, height)
+    ways, origins = (rays(pixels).astype(np.float32) for rays in (camera.directions, camera.origins))
     hits = bvh.intersect(origins, ways)
     faces, t = hits.face.numpy(), hits.t.numpy()
     seen = faces >= 0
