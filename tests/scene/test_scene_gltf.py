@@ -317,9 +317,9 @@ BROKEN = {
         "node 'n': names mesh 99, and the file has 1 meshes",
     ),
     "cycle": (edited(lambda glb, _: glb.json["nodes"][0].update(children=[0])), "two parents or on itself"),
-    "draco": (
-        edited(lambda glb, _: glb.json.update(extensionsRequired=["KHR_draco_mesh_compression"])),
-        "requires KHR_draco_mesh_compression",
+    "basisu": (
+        edited(lambda glb, _: glb.json.update(extensionsRequired=["KHR_texture_basisu"])),
+        "requires KHR_texture_basisu, whose KTX2 textures",
     ),
     "wrap": (
         edited(lambda glb, _: glb.json.update(samplers=[{"wrapS": 7}]) or glb.json["textures"][0].update(sampler=0)),

@@ -16,6 +16,7 @@ from warp_gi.errors import OptionError, SceneError
 from warp_gi.scene.animation import moving_nodes, pose_matrix, world_matrices
 from warp_gi.scene.files.gltf_animation import read_keyframes
 from warp_gi.scene.files.gltf_buffers import Buffers, split_glb
+from warp_gi.scene.files.gltf_compressed import BASISU, INSTALL, decoder
 from warp_gi.scene.files.gltf_document import Document, Part
 from warp_gi.scene.files.gltf_meshes import MeshReader
 from warp_gi.scene.files.parts import SceneParts
@@ -40,7 +41,15 @@ def read_gltf(path: Path) -> SceneParts:
 def _check_extensions(document: Document) -> None:
     """Raise SceneError for required extensions that are not supported, and note others that are not read in full."""
     read = {name for name, one in BY_NAME.items() if one.status in ("supported", "approximated")}
-    unknown = sorted(set(document.listed_extensions("extensionsRequired")) - read)
+    required = set(document.listed_extensions("extensionsRequired"))
+    for name in sorted(required & INSTALL.keys()):
+        decoder(document, name)  # raises what to install
+    if BASISU in required:
+        raise SceneError(
+            f"{str(document.path)!r} requires {BASISU}, whose KTX2 textures cannot be read; export it with PNG or JPEG"
+            " textures, or let gltf-transform turn them into such"
+        )
+    unknown = sorted(required - read)
     if unknown:
         raise SceneError(
             f"{str(document.path)!r} requires {', '.join(unknown)}, which is not supported; export it without"

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_gi.errors import SceneError
+from warp_gi.scene.files.gltf_compressed import MESHOPT, meshopt_view
 from warp_gi.scene.files.gltf_document import Document, Part
 from warp_gi.scene.files.images import find_file
 
@@ -63,6 +64,8 @@ class Buffers:
     def __init__(self, document: Document, binary: memoryview | None) -> None:
         self.document, self.path, self.binary = document, document.path, binary
         self._loaded: dict[int, memoryview] = {}
+        self._decoded: dict[int, memoryview] = {}  # buffer views of meshopt
+        self._filled: dict[int, np.ndarray] = {}  # accessors whose numbers an extension has
 
     def buffer(self, index: int, owner: str) -> memoryview:
         """Return the bytes of a buffer; raises SceneError if its file is missing or short."""
@@ -93,6 +96,15 @@ class Buffers:
         """Return the bytes of a buffer view."""
         view = self.document.item("bufferViews", index, owner)
         name = f"buffer view {index}"
+        packed = self.document.extension(view, MESHOPT, name)
+        if packed is None:
+            return self._bytes(view, name)
+        number = int(index)  # type: ignore[call-overload]
+        if number not in self._decoded:
+            self._decoded[number] = meshopt_view(self.document, self._bytes(packed, name), packed, name)
+        return self._decoded[number]
+
+    def _bytes(self, view: Part, name: str) -> memoryview:
         start = self.document.whole(view, "byteOffset", name, 0)
         length = self.document.whole(view, "byteLength", name)
         data = self.buffer(self.document.whole(view, "buffer", name), name)
@@ -118,7 +130,12 @@ class Buffers:
         if widths and width not in widths:
             raise document.error(owner, f"{name} is {kind}, and has to have {' or '.join(map(str, widths))} components")
         count = document.whole(description, "count", name)
-        if description.get("bufferView") is None:
+        if (filled := self._filled.get(int(index))) is not None:  # type: ignore[call-overload]
+            if filled.shape != (count, width):
+                shape = f"{filled.shape[0]} of {filled.shape[1]} numbers"
+                raise document.error(name, f"has {count} of {width} numbers, and its compressed data {shape}")
+            values = filled.astype(dtype)
+        elif description.get("bufferView") is None:
             if count * width > LARGEST_EMPTY:
                 raise document.error(name, f"has {count} elements and no data")
             values = np.zeros((count, width), dtype)
@@ -132,9 +149,16 @@ class Buffers:
             values = np.maximum(values.astype(np.float32) / np.iinfo(dtype.name).max, -1.0)
         return values[:, 0] if width == 1 else values
 
+    def fill(self, index: object, owner: str, values: np.ndarray) -> None:
+        """Give an accessor its numbers [count, width], which an extension holds."""
+        self.document.item("accessors", index, owner)
+        self._filled[int(index)] = values  # type: ignore[call-overload]
+
     def has_data(self, index: object, owner: str) -> bool:
         """Return whether an accessor has numbers in the file; without, it is all zero, or an extension fills it."""
         description = self.document.item("accessors", index, owner)
+        if int(index) in self._filled:  # type: ignore[call-overload]
+            return True
         return description.get("bufferView") is not None or description.get("sparse") is not None
 
     def _component(self, description: Part, name: str) -> np.dtype:

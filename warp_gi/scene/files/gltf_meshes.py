@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from warp_gi.scene.files.gltf_buffers import Buffers
+from warp_gi.scene.files.gltf_compressed import DRACO, draco_attributes
 from warp_gi.scene.files.gltf_document import Document, Part
 from warp_gi.scene.files.gltf_materials import Coordinates, MaterialReader
 from warp_gi.scene.model import Mesh
@@ -51,6 +52,7 @@ class MeshReader:
         if attributes.get("POSITION") is None:
             document.findings.add("primitives without positions", owner)
             return None
+        mode = self._decompressed(source, attributes, owner, mode)
         for what, number in (("POSITION", attributes["POSITION"]), ("indices", source.get("indices"))):
             if number is not None and not self.buffers.has_data(number, owner):
                 raise document.error(
@@ -82,6 +84,19 @@ class MeshReader:
             else self._uvs(attributes, Coordinates(coordinates.further, needed=True), owner, len(points)),
             colors=self._colors(attributes, owner, len(points)),
         )
+
+    def _decompressed(self, source: Part, attributes: Part, owner: str, mode: int) -> int:
+        """Fill accessors from the primitive's Draco data, if their numbers are there alone; return the mode then."""
+        packed = self.document.extension(source, DRACO, owner)
+        if packed is None or self.buffers.has_data(attributes["POSITION"], owner):
+            return mode
+        names = self.document.part(packed, "attributes", owner) or {}
+        view = self.buffers.view(packed.get("bufferView"), owner)
+        for name, values in draco_attributes(self.document, view, names, owner).items():
+            number = source.get("indices") if name == "indices" else attributes.get(name)
+            if number is not None:
+                self.buffers.fill(number, owner, values.reshape(len(values), -1))
+        return TRIANGLES  # whatever they were
 
     def _attribute(
         self, attributes: Part, name: str, owner: str, count: int, widths: tuple[int, ...]

@@ -46,6 +46,8 @@ FEATURES: tuple[Feature, ...] = (
         ("EXT_texture_webp", GLTF, "read in the place of its stand-in"),
         ("sparse, strided and normalized accessors", GLTF, "as they are"),
         ("KHR_mesh_quantization", GLTF, "as it is"),
+        ("KHR_draco_mesh_compression", GLTF, "by DracoPy (pip install 'warp-gi[draco]')"),
+        ("EXT_meshopt_compression", GLTF, "by meshoptimizer (pip install meshoptimizer, which needs a C++ compiler)"),
         ("EXT_mesh_gpu_instancing", GLTF, "a node for each instance"),
         ("KHR_materials_specular", GLTF, "factor, colour and both textures"),
         ("KHR_materials_ior", GLTF, "the reflectance at normal incidence; nothing refracts"),
@@ -125,8 +127,6 @@ FEATURES: tuple[Feature, ...] = (
     ),
     *_features(
         "refused",
-        ("KHR_draco_mesh_compression", GLTF, "export it without compression"),
-        ("EXT_meshopt_compression", GLTF, "export it without compression"),
         ("KHR_texture_basisu", GLTF, "export textures as PNG or JPEG"),
     ),
 )
