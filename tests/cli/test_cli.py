@@ -3,6 +3,7 @@
 import ctypes
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -12,6 +13,7 @@ import time
 import numpy as np
 import pytest
 import trimesh
+from scene_tools import GlbBuilder
 
 from warp_gi.cli import main as cli
 from warp_gi.cli.interrupts import stoppable
@@ -320,6 +322,18 @@ def test_warnings_are_one_line(capfd, tmp_path):
     assert cli.main(["info", str(tmp_path / "a.obj")]) == 0
     error = capfd.readouterr().err
     assert error.startswith("warp-gi: warning: ") and error.count("\n") == 1 and "gone.mtl" in error
+
+
+def test_info_tells_copies_of_meshes(capfd, tmp_path):
+    """A mesh that stands in three nodes has its triangles three times; nothing is said where none does."""
+    glb = GlbBuilder()
+    mesh = glb.mesh()
+    nodes = [glb.add("nodes", {"mesh": mesh}) for _ in range(3)]
+    glb.json["scenes"] = [{"nodes": nodes}]
+    assert cli.main(["info", str(glb.write(tmp_path / "a.glb"))]) == 0
+    assert re.search("copies of shared meshes +2, with 2 of the triangles", capfd.readouterr().out)
+    assert cli.main(["info", "cornell_box"]) == 0
+    assert "copies" not in capfd.readouterr().out
 
 
 def test_no_memory_is_one_line(capfd, monkeypatch):

@@ -11,7 +11,7 @@ import tyro
 from warp_gi.cli.inputs import open_scene
 from warp_gi.cli.options import parse_options
 from warp_gi.cli.report import print_table, start_warp
-from warp_gi.scene.model import Material
+from warp_gi.scene.model import Material, Mesh
 from warp_gi.scene.pinhole import offset_text
 from warp_gi.scene.scene import Scene
 from warp_gi.scene.textures import distinct_textures
@@ -70,6 +70,7 @@ def summary(scene: Scene) -> list[tuple[str, object]]:
         ("triangles", scene.triangle_count),
         ("vertices", sum(len(mesh.points) for mesh in meshes)),
         ("meshes", len(meshes)),
+        *_shared(meshes),
         ("objects", len(scene.object_names)),
         ("materials", len(scene.materials)),
         ("textures", len(distinct_textures(scene.materials))),
@@ -83,8 +84,18 @@ def summary(scene: Scene) -> list[tuple[str, object]]:
         ("lowest corner [m]", _numbers(low)),
         ("highest corner [m]", _numbers(high)),
         ("memory [MB]", scene.memory_bytes / 1e6),
+        ("memory a triangle [B]", round(scene.memory_bytes / scene.triangle_count)),
         ("hash", scene.hash[:16]),
     ]
+
+
+def _shared(meshes: Sequence[Mesh]) -> list[tuple[str, object]]:
+    """Return a row about meshes that stand in several nodes, if there are any: each node has triangles of its own."""
+    once = {id(mesh): mesh for mesh in meshes}
+    if len(once) == len(meshes):
+        return []
+    needed, all_of_them = (sum(len(mesh.indices) for mesh in some) for some in (once.values(), meshes))
+    return [("copies of shared meshes", f"{len(meshes) - len(once)}, with {all_of_them - needed} of the triangles")]
 
 
 def _material_row(material: Material) -> tuple[object, ...]:
