@@ -57,6 +57,7 @@ _PUBLIC = {
     "builtin_camera_path": "warp_gi.scene.builtin",
     "AlphaMasks": "warp_gi.bvh",
     "set_threads": "warp_gi.launch",
+    "set_verbosity": "warp_gi.verbosity",
 }
 _MODULES = ("metrics",)
 # classes and functions of techniques: the registry names them

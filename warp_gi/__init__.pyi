@@ -66,3 +66,4 @@ from warp_gi.techniques.visibility_field.estimator import VisibilityField as Vis
 
 __version__: str
 __all__: list[str]
+from warp_gi.verbosity import set_verbosity as set_verbosity

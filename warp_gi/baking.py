@@ -49,6 +49,12 @@ class Bake:
     scene_name: str = ""
     """Name of the scene, for messages only."""
 
+    def __repr__(self) -> str:
+        """Return a line; arrays by their shapes."""
+        arrays = ", ".join(f"{name} {list(np.shape(array))}" for name, array in self.arrays.items())
+        settings = ", ".join(f"{name}={value!r}" for name, value in self.settings.items())
+        return f"<Bake {self.technique}({settings}) of {self.scene_name!r}, {self.nbytes / 1e6:.3g} MB: {arrays}>"
+
     @property
     def nbytes(self) -> int:
         """Size of all arrays, in bytes."""

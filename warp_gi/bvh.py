@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import mmap
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,20 @@ class AlphaMasks:
     """Texels of all textures, uint32 RGBA8 [texel] with red in the low byte, on the tree's device."""
     alphas: np.ndarray | None = None
     """Coverage of vertices, multiplied with that of textures, float32 [vertex]; None is 1."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        given = [getattr(self, one.name) for one in fields(self)]
+        device = str(self.textures.device)
+        return _masks, (device, *(one.numpy() if isinstance(one, wp.array) else one for one in given))
+
+
+def _masks(device: str, *given: Any) -> AlphaMasks:
+    """Return masks on a device, of arrays that were on one."""
+    target, names = launch.get_device(device), [one.name for one in fields(AlphaMasks)]
+    values = dict(zip(names, given, strict=True))
+    values["textures"] = launch.on_device(values["textures"], types.Texture, target)
+    values["texels"] = launch.on_device(values["texels"], wp.uint32, target)
+    return AlphaMasks(**values)
 
 
 @dataclass(eq=False)
@@ -93,6 +107,13 @@ class TriangleBvh:
         else:
             self._mesh = _make_mesh(self._positions, corners, positions)
             self.data.mesh = self._mesh.id
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        arrays = self._positions.numpy(), self._indices.numpy()
+        return TriangleBvh, (*arrays, self.device.alias, self._alpha)
+
+    def __repr__(self) -> str:
+        return f"<TriangleBvh: {self.triangle_count:,} triangles on {self.device.alias!r}>"
 
     @property
     def memory_bytes(self) -> int:

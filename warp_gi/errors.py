@@ -56,6 +56,13 @@ def check_whole(name: str, value: object, least: int, most: int) -> None:
         raise OptionError(f"{name} must be a whole number from {least} to {most}, got {value!r}")
 
 
+def whole_number(name: str, value: object) -> int:
+    """Return a whole number as Python's own, of NumPy's kinds too; raises OptionError for what is none."""
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise OptionError(f"{name} must be a whole number, got {value!r:.80}")
+    return int(value)
+
+
 def check_number(name: str, value: object) -> None:
     """Raise OptionError unless a setting is a number."""
     if isinstance(value, str | bytes) or not hasattr(value, "__float__"):

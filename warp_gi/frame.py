@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 TERMS = ("environment", "emitters", "indirect")
 """Terms of the light that estimators stand for; emission, the fourth, is always exact."""
+_COPIED = ("camera", "previous_camera", "index", "previous_index", "time", "seed", "settings", "pipeline_samples")
+"""What a copy of a frame has beside its pixels, timings and metadata."""
 _VEC3_BUFFERS = ("beauty", "emission", *TERMS, "albedo", "normal", "position", "variance", "moment1", "moment2")
 BUFFERS = (
     "beauty",
@@ -151,6 +153,35 @@ class Frame:
         self.camera_data, self.previous_camera_data = camera_data(camera), camera_data(previous_camera)
         self.pass_settings = gbuffer.PassSettings()
         """Seed, samples and filter of the current camera sample, as kernels read them."""
+
+    # ---- in Python programs ----
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy has: pixels and what describes them, but no scene and nothing on a device."""
+        values = {name: getattr(self, name) for name in (*_COPIED, "timings", "metadata")}
+        return values | {"_arrays": {name: self.numpy(name) for name in self.names}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the pixels of another frame; they are on the CPU."""
+        self.__dict__ |= state
+        self.device = launch.get_device("cpu")
+        kinds = {name: array.shape[2:] for name, array in state["_arrays"].items()}
+        flat = {name: array.reshape(-1, *kinds[name]).copy() for name, array in state["_arrays"].items()}
+        vectors = {(2,): wp.vec2, (3,): wp.vec3}
+        self._arrays = {
+            name: launch.on_device(array, vectors.get(kinds[name]) or wp.dtype_from_numpy(array.dtype), self.device)
+            for name, array in flat.items()
+        }
+
+    def __repr__(self) -> str:
+        width, height = self.camera.resolution
+        return f"<Frame {self.index}: {width}x{height}, {self.settings.spp} samples a pixel, {', '.join(self.names)}>"
+
+    def _repr_png_(self) -> bytes:
+        """Return the picture as a notebook shows it."""
+        from warp_gi.sequence.preview import picture_bytes
+
+        return picture_bytes(self.numpy("beauty"))
 
     # ---- buffers ----
 

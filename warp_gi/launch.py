@@ -26,6 +26,9 @@ import warp as wp
 
 from warp_gi import forks, loading, workers
 from warp_gi.errors import OptionError
+from warp_gi.verbosity import quieten_warp
+
+quieten_warp()
 
 Struct = TypeVar("Struct")
 """Class of a kernel struct."""

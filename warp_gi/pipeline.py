@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from numbers import Integral
 from typing import Any
 
 from warp_gi import registry
 from warp_gi.baking import Bake
 from warp_gi.denoise import DENOISERS, Denoiser, denoiser_named
-from warp_gi.errors import OptionError, unknown_name
+from warp_gi.errors import OptionError, unknown_name, whole_number
 from warp_gi.estimator import Estimator
 from warp_gi.frame import TERMS, FrameSettings
 from warp_gi.primary import CameraRays, Primary
@@ -69,9 +68,8 @@ class Pipeline:
 
     def __post_init__(self) -> None:
         for name in ("spp", "camera_samples"):
-            count = getattr(self, name)
-            if count is not None and (isinstance(count, bool) or not isinstance(count, Integral)):
-                raise OptionError(f"{name} must be a whole number, got {count!r}")
+            if (count := getattr(self, name)) is not None:
+                object.__setattr__(self, name, whole_number(name, count))
         if self.spp < 1:
             raise OptionError(f"spp must be at least 1, got {self.spp}")
         if self.spp > MOST_SAMPLES:

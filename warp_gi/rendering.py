@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from warp_gi import launch
 from warp_gi.baking import Bake
-from warp_gi.errors import OptionError
+from warp_gi.errors import OptionError, whole_number
 from warp_gi.estimator import Estimator
 from warp_gi.foretold import kernels_of
 from warp_gi.kept import BakeFolder, cached_bake
@@ -212,7 +212,7 @@ def _frame_numbers(camera: Camera | CameraPath, frames: Iterable[int] | None) ->
     """Return the frames to render, None being every one of the camera's; raises OptionError for negative ones."""
     if frames is None:
         frames = range(camera.frame_count if isinstance(camera, CameraPath) else 1)
-    frames = list(frames)
+    frames = [whole_number("frame numbers", index) for index in frames]
     if any(index < 0 for index in frames):
         raise OptionError(f"frame numbers must be 0 or above, got {min(frames)}")
     return frames

@@ -96,7 +96,7 @@ class FrameScheduler:
             raise OptionError(f"seed must be 0 or above, got {seed}")
         self.scene = BakedScene(scene) if isinstance(scene, Bake) else scene
         self.pipeline = pipeline.fitting(scene) if isinstance(scene, Bake) else pipeline
-        self.camera, self.seed = camera.relative_to(self.scene.offset), seed
+        self.camera, self.seed = camera.relative_to(self.scene.offset), int(seed)
         self.device = launch.get_device(device)
         self._progress = progress or (lambda stage, share: None)
         self._parts = self.pipeline.parts()
@@ -211,7 +211,7 @@ class FrameScheduler:
 
         A frame that an exception interrupts leaves nothing behind: what is rendered next is as if it had not begun.
         """
-        began, timings = time.perf_counter(), {"bake": 0.0, "compile": 0.0}
+        index, began, timings = int(index), time.perf_counter(), {"bake": 0.0, "compile": 0.0}
         with timed(timings, "scene", self.device):
             self.scene.check_unchanged()
         baking = time.perf_counter()

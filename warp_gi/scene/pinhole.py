@@ -100,6 +100,17 @@ class Camera:
             )
         object.__setattr__(self, "resolution", (width, height))
 
+    def __eq__(self, other: object) -> bool:
+        """Return whether another camera makes the same pictures, whatever its name."""
+        return self._key == other._key if isinstance(other, Camera) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    @property
+    def _key(self) -> tuple[object, ...]:
+        return (self.world_from_camera + 0.0).tobytes(), self.lens, self.keeps_vertical, self.offset  # no -0
+
     @classmethod
     def look_at(
         cls,

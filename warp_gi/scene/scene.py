@@ -15,7 +15,7 @@ from warp_gi.errors import SceneError, unknown_name
 from warp_gi.forks import Guard
 from warp_gi.kernels import types
 from warp_gi.launch import get_device
-from warp_gi.scene import animation, emitters, geometry, textures
+from warp_gi.scene import animation, copying, emitters, geometry, textures
 from warp_gi.scene.device_scene import DeviceScene
 from warp_gi.scene.edits import Edits
 from warp_gi.scene.model import Keyframe, Material, Node, PunctualLight
@@ -80,6 +80,12 @@ class Scene:
         """Time in seconds of the present sky, if it is a function of time; None while it changes."""
         self._sky_shown: tuple[object, ...] | None = None
         self.environment = environment
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return copying.made, copying.contents(self)
+
+    def __repr__(self) -> str:
+        return copying.description(self)
 
     def _flatten(self) -> None:
         """Build what follows from the nodes; call again when keyframes change."""

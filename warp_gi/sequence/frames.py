@@ -21,7 +21,7 @@ from warp_gi.files import frame_path, replacing, user_path
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.pinhole import offset_text
 from warp_gi.sequence.exr import Attribute, plain, read_exr, stored_values, write_exr
-from warp_gi.sequence.preview import tone_map, write_png
+from warp_gi.sequence.preview import picture_bytes, tone_map, write_png
 
 MOST_FRAMES = 1_000_000
 PREFIX = "warp_gi/"
@@ -96,6 +96,14 @@ class FrameFile:
     def names(self) -> tuple[str, ...]:
         """Names of the buffers."""
         return tuple(self.buffers)
+
+    def __repr__(self) -> str:
+        height, width = next(iter(self.buffers.values())).shape[:2]
+        return f"<FrameFile {self.index}: {width}x{height}, {', '.join(self.names)}>"
+
+    def _repr_png_(self) -> bytes | None:
+        """Return the picture as a notebook shows it; None in files without a beauty."""
+        return picture_bytes(self.buffers["beauty"]) if "beauty" in self.buffers else None
 
     def numpy(self, name: str) -> np.ndarray:
         """Return a buffer by name; raises OptionError if the file has none of that name."""
