@@ -27,7 +27,7 @@ from warp_gi.pipeline import DENOISER, Pipeline
 from warp_gi.primary import CameraRays
 from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import BakedScene, whole_scene
-from warp_gi.scene.camera import Camera, CameraPath, frame_time
+from warp_gi.scene.camera import Camera, CameraPath, frame_time, warn_if_far
 from warp_gi.scene.scene import Scene
 from warp_gi.scene.sky_motion import sky_start
 from warp_gi.sequence.state import Dependence, state_arrays, with_arrays
@@ -97,6 +97,8 @@ class FrameScheduler:
         self.scene = BakedScene(scene) if isinstance(scene, Bake) else scene
         self.pipeline = pipeline.fitting(scene) if isinstance(scene, Bake) else pipeline
         self.camera, self.seed = camera.relative_to(self.scene.offset), int(seed)
+        if isinstance(self.scene, Scene):
+            warn_if_far(self.camera, self.scene)
         self.device = launch.get_device(device)
         self._progress = progress or (lambda stage, share: None)
         self._parts = self.pipeline.parts()

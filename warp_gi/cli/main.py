@@ -15,6 +15,7 @@ from warp_gi.errors import GiError, one_line, unknown_name
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
+DEBUG = "WARP_GI_DEBUG=1 shows where it came from"
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,8 @@ WARP_GI_DEBUG=1 shows where they came from.
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code: 0, 2 after an error, 130 when interrupted."""
     is_process = arguments is None
+    if is_process:
+        _open_closed_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # names in scenes, and ±, where the terminal has no UTF-8
     arguments = list(sys.argv[1:] if arguments is None else arguments)
@@ -73,16 +76,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"warp-gi: error: {_message(error)}", file=sys.stderr)
         return EXIT_ERROR
-    except RuntimeError as error:
-        if "Failed to allocate" not in str(error) or os.environ.get("WARP_GI_DEBUG", "0") != "0":
+    except Exception as error:
+        if os.environ.get("WARP_GI_DEBUG", "0") != "0":
             raise
-        print(f"warp-gi: error: not enough memory: {_message(error)}", file=sys.stderr)  # Warp's own allocators
+        if isinstance(error, RuntimeError) and "Failed to allocate" in str(error):  # Warp's own allocators
+            print(f"warp-gi: error: not enough memory: {_message(error)}", file=sys.stderr)
+        else:
+            what = f"{type(error).__name__}: {_message(error)}".rstrip(": ")
+            print(f"warp-gi: error: a fault of warp-gi, please report it ({what}); {DEBUG}", file=sys.stderr)
         return EXIT_ERROR
     except KeyboardInterrupt as interrupt:
         if is_process:  # a second Ctrl-C would break off the interpreter's leaving with a traceback
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         print(": ".join(["warp-gi: interrupted", *map(str, interrupt.args)]), file=sys.stderr)
         return EXIT_INTERRUPTED
+
+
+def _open_closed_streams() -> None:
+    """Open what is closed of standard input, output and error, which a file of ours would take the place of."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
+    sys.stdout = sys.stdout or open(1, "w", closefd=False)
+    sys.stderr = sys.stderr or open(2, "w", closefd=False)
 
 
 def _dispatch(arguments: list[str]) -> int:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import math
+import warnings
+from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +17,7 @@ import numpy as np
 
 from warp_gi.errors import OptionError, SceneError, unknown_name
 from warp_gi.files import user_path
+from warp_gi.scene.animation import key_times
 from warp_gi.scene.camera_files import naming_file, read_camera_file
 from warp_gi.scene.pinhole import Camera
 
@@ -24,6 +28,10 @@ __all__ = ["STILL_FPS", "Camera", "CameraKey", "CameraPath", "frame_time"]
 
 Vec3 = tuple[float, float, float]
 
+MOST_BETWEEN, CLOSE = 240, 4
+"""Keys of a path between two keyframes of a scene, and frames beside each of these that have a key in any case."""
+COARSE = 2e-3
+"""Largest step of float32 positions at a camera, in radii of the scene, that goes without a warning."""
 STILL_FPS = 24.0
 """Frames per second of a camera that is no path."""
 
@@ -95,11 +103,11 @@ class CameraPath:
 
     def camera_at(self, time: float) -> Camera:
         """Return the camera at a time in seconds, held before the first and after the last key."""
-        lenses = ([k.hfov, *k.lens_shift, k.pixel_aspect, k.ortho_width] for k in self.keys)
-        rows = np.array(
-            [[*k.eye, *k.target, *k.up, *lens] for k, lens in zip(self.keys, lenses, strict=True)], np.float64
-        )
-        pose = _hermite(np.array([k.time for k in self.keys]), rows, time)
+        after = bisect_right(self.keys, time, key=lambda key: key.time)
+        keys = self.keys[max(after - 2, 0) : after + 2]  # those that decide it
+        lenses = ([k.hfov, *k.lens_shift, k.pixel_aspect, k.ortho_width] for k in keys)
+        rows = np.array([[*k.eye, *k.target, *k.up, *lens] for k, lens in zip(keys, lenses, strict=True)], np.float64)
+        pose = _hermite(np.array([k.time for k in keys]), rows, time)
         camera = Camera.look_at(pose[0:3], pose[3:6], pose[6:9], float(pose[9]), self.resolution, self.name)
         right, above, pixel_aspect, width = pose[10:].tolist()
         shift = right, above
@@ -184,7 +192,8 @@ class CameraPath:
     def from_scene(cls, scene: Scene, name: str | None = None, fps: float = 24.0) -> CameraPath:
         """Return the path of a scene's camera, one key a frame over the scene's animation; it may stand still.
 
-        ``name`` None is the first camera. Raises OptionError if there is none of that name.
+        Between keyframes of the scene that are far apart it has fewer. ``name`` None is the first camera. Raises
+        OptionError if there is none of that name.
         """
         if name is None:
             name = next(iter(scene.cameras), "")
@@ -194,9 +203,9 @@ class CameraPath:
         node = scene.camera_nodes.get(name)
         if node is None or not scene.moves(node):
             return replace(cls.still(camera), fps=fps)
-        frames = range(math.floor(scene.duration * fps + 1e-6) + 1)
+        frames = _telling_frames(key_times(scene.nodes), fps)
         poses = [replace(camera, world_from_camera=scene.world_from_node(node, i / fps)) for i in frames]
-        return cls.from_cameras(poses, fps=fps)
+        return cls.from_cameras(poses, [i / fps for i in frames], fps)
 
     @classmethod
     def load(cls, path: str | Path) -> CameraPath:
@@ -249,6 +258,36 @@ class CameraPath:
         user_path(path).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
+def _telling_frames(times: Iterable[float], fps: float) -> list[int]:
+    """Return the frames from 0 to the last of ``times`` [s], and between times that are far apart a few of them.
+
+    A pose is a smooth function between the times of keyframes, and may turn sharply at these.
+    """
+    ends = [0, *(math.floor(time * fps + 1e-6) for time in sorted(times) if time > 0)]
+    chosen: set[int] = {0}
+    for begin, end in itertools.pairwise(ends):
+        if end - begin <= MOST_BETWEEN:
+            chosen.update(range(begin, end + 1))
+        else:
+            chosen.update(np.linspace(begin, end, MOST_BETWEEN).astype(np.int64).tolist())
+            chosen.update((*range(begin, begin + CLOSE), *range(end - CLOSE + 1, end + CLOSE)))
+    return sorted(frame for frame in chosen if frame <= ends[-1])
+
+
+def warn_if_far(camera: Camera | CameraPath, scene: Scene) -> None:
+    """Warn of a camera so far off that float32 cannot place it as exactly as the scene's size asks for."""
+    path = camera if isinstance(camera, CameraPath) else CameraPath.still(camera)
+    farthest = max(float(np.abs(path.camera_at(key.time).position).max()) for key in (path.keys[0], path.keys[-1]))
+    step = float(np.spacing(np.float32(farthest)))
+    if step > COARSE * scene.radius:
+        warnings.warn(
+            f"the camera is {farthest:.3g} m from the origin, where float32 positions have steps of {step:.2g} m, and"
+            f" the scene's radius is {scene.radius:.2g} m: pictures will be wrong; move the camera nearer, or use"
+            " recentre for scenes far from the origin",
+            stacklevel=3,
+        )
+
+
 def frame_time(camera: Camera | CameraPath, index: int) -> float:
     """Return the time of a frame in seconds: that of the path, or of ``STILL_FPS`` frames a second."""
     return index / (camera.fps if isinstance(camera, CameraPath) else STILL_FPS)
@@ -279,13 +318,14 @@ def _hermite(times: np.ndarray, rows: np.ndarray, time: float) -> np.ndarray:
 
 
 def views_hash(camera: Camera | CameraPath | None) -> str:
-    """Return a SHA-256 of all views of a camera, in hexadecimal digits: placements, lenses and sizes."""
-    digest = hashlib.sha256(b"warp_gi views 1")
-    views = [camera] if isinstance(camera, Camera) else []
-    if isinstance(camera, CameraPath):
-        views = [camera.camera(index) for index in range(camera.frame_count)]
-    for one in views:
-        digest.update(one.world_from_camera.tobytes())
-        lens = (one.hfov, *one.resolution, *one.lens_shift, one.pixel_aspect, one.ortho_width)
-        digest.update(np.array(lens, np.float64).tobytes())
+    """Return a SHA-256 of all that decides the views of a camera, in hexadecimal digits: keys, lenses and sizes."""
+    digest = hashlib.sha256(b"warp_gi views 2")
+    if isinstance(camera, Camera):
+        camera = CameraPath.still(camera)
+    if camera is not None:
+        numbers = [camera.fps, *camera.resolution, *camera.offset]
+        for key in camera.keys:
+            numbers += [key.time, *key.eye, *key.target, *key.up]
+            numbers += [key.hfov, *key.lens_shift, key.pixel_aspect, key.ortho_width]
+        digest.update(np.array(numbers, np.float64).tobytes())
     return digest.hexdigest()

@@ -36,6 +36,10 @@ class PlacedEmitters:
     """Whether both sides shine, bool [emissive triangle]."""
 
 
+LARGEST_INTENSITY, LARGEST_POSITION = 1e30, 1e30
+"""Past these, squares and products of what kernels compute with leave float32."""
+
+
 def check_light(light: PunctualLight, nodes: Sequence[Node]) -> None:
     """Raise SceneError where a field of ``light`` is unknown, out of range or not finite."""
     name = f"light {light.name!r}"
@@ -45,6 +49,10 @@ def check_light(light: PunctualLight, nodes: Sequence[Node]) -> None:
         values = np.asarray(getattr(light, label), np.float64)
         if values.shape != (3,) or not np.isfinite(values).all():
             raise SceneError(f"{name}: {label} must be 3 finite numbers, got {getattr(light, label)!r}")
+    if max(light.intensity) > LARGEST_INTENSITY:
+        raise SceneError(f"{name}: intensity must be at most {LARGEST_INTENSITY:g}, got {max(light.intensity):g}")
+    if np.abs(light.position).max() > LARGEST_POSITION:
+        raise SceneError(f"{name}: position must be within {LARGEST_POSITION:g} m, got {light.position!r}")
     if min(light.intensity) < 0.0:
         raise SceneError(f"{name}: intensity must not be negative, got {light.intensity}")
     if light.kind != "point" and not np.linalg.norm(light.direction) > 1e-12:

@@ -37,6 +37,7 @@ T = TypeVar("T")
 
 __all__ = ["Environment", "SunSky", "SunSplit", "as_environment"]
 
+LARGEST_RADIANCE = 1e30  # W/(m^2 sr); past it products of what kernels compute with leave float32
 NEGLIGIBLE_NEGATIVE = 1e-4  # share of the sum of all pixels; less is set to 0
 
 
@@ -65,9 +66,19 @@ class Environment:
             raise SceneError(f"environment scale must be finite and not negative, got {self.scale}")
         if self.color is not None:
             self.color = _checked_color(self.color)
+            self._check_range(max(self.color))
         if self.pixels is not None and self._map is None:
             self.pixels = _checked_pixels(self.pixels, self.name)
             self._map = SkyMap(self.pixels)
+        if self.pixels is not None and self.scale > 1.0:
+            self._check_range(float(self.pixels.max()))
+
+    def _check_range(self, peak: float) -> None:
+        if not peak * self.scale <= LARGEST_RADIANCE:
+            raise SceneError(
+                f"{self.name}: radiance must be at most {LARGEST_RADIANCE:g} W/(m^2 sr), which kernels can compute"
+                f" with, got {peak:g} times a scale of {self.scale:g}"
+            )
 
     @staticmethod
     def load(path: str | Path, rotation: float = 0.0, scale: float = 1.0, layer: str = "") -> Environment:
@@ -301,6 +312,8 @@ def _checked_pixels(pixels: object, name: str) -> np.ndarray:
     if not np.isfinite(pixels).all():
         bad = int((~np.isfinite(pixels).all(-1)).sum())
         raise SceneError(f"{name}: {bad} pixels are NaN or infinite; repair the image")
+    if pixels.max() > LARGEST_RADIANCE:
+        raise SceneError(f"{name}: radiance must be at most {LARGEST_RADIANCE:g}, highest is {pixels.max():.3g}")
     if pixels.min() < 0:
         raise SceneError(f"{name}: radiance must not be negative, lowest is {pixels.min():.3g}")
     return pixels

@@ -18,6 +18,9 @@ Vector = Sequence[float] | np.ndarray
 
 CONVENTIONS = {"opencv": (1.0, -1.0, -1.0, 1.0), "opengl": (1.0, 1.0, 1.0, 1.0)}
 """Factors on the axes of a camera's space that make it x right, y up, z backward."""
+LEAST_FOV, MOST_FOV = 1e-3, 179.9999
+"""Degrees of a field of view outside which neighbouring pixels have the same float32 direction."""
+FARTHEST = 1e15  # metres; beyond, squares of distances leave float32
 LARGEST_SIDE = 1 << 16  # pixels; their Morton code has 16 bits an axis
 LARGEST_COUNT = 1 << 30  # pixels; kernels count them in int32
 
@@ -26,8 +29,8 @@ LARGEST_COUNT = 1 << 30  # pixels; kernels count them in int32
 class Camera:
     """A perspective (pinhole) or orthographic camera. It looks along -z of its own space, x is right and y up.
 
-    It has no depth of field and no lens distortion. Raises OptionError for a field of view outside (0, 180) degrees,
-    an empty resolution, or a matrix that is singular, reflected or not finite.
+    It has no depth of field and no lens distortion. Raises OptionError for a field of view that is not between
+    0.001 and 180 degrees, an empty resolution, or a matrix that is singular, reflected or not finite.
     """
 
     world_from_camera: np.ndarray
@@ -75,8 +78,12 @@ class Camera:
         object.__setattr__(self, "world_from_camera", matrix)
         check_number(f"camera {self.name!r}: hfov", self.hfov)
         check_number(f"camera {self.name!r}: pixel_aspect", self.pixel_aspect)
-        if not 0.0 < self.hfov < 180.0:
-            raise OptionError(f"camera {self.name!r}: hfov must be between 0 and 180 degrees, got {self.hfov}")
+        if not LEAST_FOV <= self.hfov <= MOST_FOV:
+            raise OptionError(
+                f"camera {self.name!r}: hfov must be from {LEAST_FOV:g} to {MOST_FOV:.4f} degrees, got {self.hfov}"
+            )
+        if not np.abs(matrix[:3, 3]).max() <= FARTHEST:
+            raise OptionError(f"camera {self.name!r}: its position must be within {FARTHEST:g} m, got {matrix[:3, 3]}")
         if not (self.pixel_aspect > 0 and math.isfinite(self.pixel_aspect)):
             raise OptionError(f"camera {self.name!r}: pixel_aspect must be finite and above 0, got {self.pixel_aspect}")
         check_number(f"camera {self.name!r}: ortho_width", self.ortho_width)

@@ -16,18 +16,30 @@ from pathlib import Path
 import numpy as np
 
 from warp_gi.color import encode_srgb
+from warp_gi.errors import OptionError, check_number
 from warp_gi.files import replacing
 
+MOST_STOPS = 100.0
+"""Largest exposure up or down: float32 has 277 stops from its least to its largest number."""
 _MIDDLE = 0.6
 _INPUT = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]])
 _OUTPUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]])
 
 
+def check_exposure(exposure: float) -> None:
+    """Raise OptionError for an exposure that is no number of stops from -MOST_STOPS to MOST_STOPS."""
+    check_number("exposure", exposure)
+    if not -MOST_STOPS <= exposure <= MOST_STOPS:
+        raise OptionError(f"exposure must be from {-MOST_STOPS:g} to {MOST_STOPS:g} stops, got {exposure:g}")
+
+
 def tone_map(image: np.ndarray, exposure: float = 0.0) -> np.ndarray:
     """Return linear radiance [height, width, 3] as sRGB uint8 [height, width, 3].
 
-    ``exposure`` is in stops: +1 doubles the light. NaN becomes black, infinity white.
+    ``exposure`` is in stops: +1 doubles the light. NaN becomes black, infinity white. Raises OptionError for an
+    exposure past 100 stops.
     """
+    check_exposure(exposure)
     light = np.nan_to_num(np.asarray(image, np.float64), nan=0.0, posinf=1e6, neginf=0.0)
     x = np.clip(light * 2.0**exposure / _MIDDLE, 0, 1e6) @ _INPUT.T
     x = (x * (x + 0.0245786) - 0.000090537) / (x * (0.983729 * x + 0.4329510) + 0.238081)

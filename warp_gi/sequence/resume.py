@@ -32,6 +32,7 @@ from warp_gi.sequence.frames import (
     write_frame,
     write_preview,
 )
+from warp_gi.sequence.preview import check_exposure
 from warp_gi.sequence.state import Dependence
 
 if TYPE_CHECKING:
@@ -63,6 +64,7 @@ class Output:
         object.__setattr__(self, "pattern", user_path(self.pattern))
         if self.pattern.suffix.lower() not in (".exr", ".png"):
             raise OptionError(f"cannot write {self.pattern.name}: frames are .exr or .png files")
+        check_exposure(self.exposure)
         if self.precision not in PRECISIONS:
             raise unknown_name("precision", self.precision, PRECISIONS)
 

@@ -14,17 +14,19 @@ PLAIN_LENS = (0.0, 0.0, 1.0, 0.0)
 """The last numbers of the row of a perspective camera without a lens shift and with square pixels."""
 SPREAD = 32
 """Largest number of frames of a path that stand for all of it."""
+MOST = 4096
+"""Largest number of frames where every one is asked for."""
 
 
 def cameras_of(camera: Camera | CameraPath | None, every: bool = False) -> list[Camera]:
-    """Return the cameras of a path's frames: of ``every`` frame, or of ``SPREAD`` frames spread over it."""
+    """Return the cameras of a path's frames: of ``every`` frame up to ``MOST``, or of ``SPREAD`` spread over it."""
     if camera is None:
         return []
     if isinstance(camera, Camera):
         return [camera]
     count = camera.frame_count
-    frames = np.linspace(0, count - 1, count if every else min(count, SPREAD))
-    return [camera.camera(int(frame)) for frame in np.unique(np.round(frames))]
+    spread = [np.linspace(0, count - 1, min(count, most)) for most in ((MOST, SPREAD) if every else (SPREAD,))]
+    return [camera.camera(int(frame)) for frame in np.unique(np.round(np.concatenate(spread)))]
 
 
 def known_rows(rows: np.ndarray) -> np.ndarray:
