@@ -4,14 +4,24 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
+import hashlib
 import os
 import re
 import shutil
+import socket
 import tempfile
+import time
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
 from warp_gi.errors import OptionError
+
+OLD = 86_400.0
+"""Seconds after which a temporary file of another machine is taken for one of a killed process."""
+_in_use: set[str] = set()
+"""Names of the temporary files that threads of this process are writing."""
 
 
 def user_path(path: str | os.PathLike[str]) -> Path:
@@ -55,11 +65,12 @@ def replacing(path: str | Path, own_folder: bool = False) -> Iterator[Path]:
     path = user_path(path)
     check_replaceable(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    if own_folder:
-        part.mkdir(exist_ok=True)
+    part = path.with_name(f".{path.name}.{machine()}-{os.getpid()}-{uuid.uuid4().hex[:8]}.part")
+    _in_use.add(part.name)
     file = part / path.name if own_folder else part
     try:
+        if own_folder:
+            part.mkdir()
         file.write_bytes(b"")
         mode = file.stat().st_mode
         yield file
@@ -70,8 +81,11 @@ def replacing(path: str | Path, own_folder: bool = False) -> Iterator[Path]:
     except BaseException:
         _remove(part)
         raise
-    if own_folder:
-        _remove(part)
+    else:
+        if own_folder:
+            _remove(part)
+    finally:
+        _in_use.discard(part.name)
 
 
 def check_writable(folder: Path) -> None:
@@ -121,15 +135,34 @@ def prune(folder: Path, pattern: str, most_bytes: int, spared: Path | None = Non
 
 
 def remove_stale_parts(path: str | Path) -> None:
-    """Remove the temporary files that a killed process left for ``path``; those of living processes stay."""
+    """Remove the temporary files that a killed process left for ``path``; those of living processes stay.
+
+    Of another machine or container, whose processes cannot be asked for, those go that are a day old.
+    """
     path = Path(path)
-    name = re.compile(rf"\.{re.escape(path.name)}\.(\d+)\.part")
+    name = re.compile(rf"\.{re.escape(path.name)}\.([0-9a-f]{{8}})-(\d+)-[0-9a-f]{{8}}\.part")
     if not path.parent.is_dir():
         return
     for candidate in path.parent.iterdir():
-        match = name.fullmatch(candidate.name)
-        if match and (int(match[1]) == os.getpid() or not _is_running(int(match[1]))):
-            _remove(candidate)
+        if (match := name.fullmatch(candidate.name)) is None or candidate.name in _in_use:
+            continue
+        with contextlib.suppress(FileNotFoundError):  # another process has just removed it
+            if match[1] != machine():
+                is_stale = time.time() - candidate.stat().st_mtime > OLD
+            else:
+                is_stale = int(match[2]) == os.getpid() or not _is_running(int(match[2]))
+            if is_stale:
+                _remove(candidate)
+
+
+@functools.cache
+def machine() -> str:
+    """Return eight digits that tell machines and containers apart: those whose processes have other numbers."""
+    parts = [socket.gethostname()]
+    for file in ("/proc/sys/kernel/random/boot_id", "/proc/self/ns/pid"):
+        with contextlib.suppress(OSError):
+            parts.append(os.readlink(file) if "ns" in file else Path(file).read_text())
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:8]
 
 
 def frame_path(pattern: str | Path, index: int) -> Path:

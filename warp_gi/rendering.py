@@ -80,8 +80,9 @@ def render(
             command uses. The frames are the same to the last bit. None keeps none.
 
     Raises OptionError for a device that is not there, a negative frame or seed, files that frames cannot be, several
-    frames for one file; BakeError for a bake of another scene or other settings; SceneError for a scene that was
-    edited so that pictures would not show it; OSError for files that cannot be written.
+    frames for one file, or files that another process is writing; BakeError for a bake of another scene or other
+    settings; SceneError for a scene that was edited so that pictures would not show it; OSError for files that cannot
+    be written.
     """
     if output is None and (resume or preview or exposure or precision != "half"):
         raise OptionError('resume, precision, preview and exposure are of files; give output="out/shot.####.exr" too')
@@ -109,12 +110,15 @@ def render(
     if frame_time is not None:
         take_time(run, frame_time, resume)
     plan = run.plan(resume)
-    run.prepare(plan)
-    for shot in plan.todo:
-        frame = run.render(shot)
-        run.save_state(shot, frame)
-        yield frame
-        del frame  # before there is a next one
+    try:
+        run.prepare(plan)
+        for shot in plan.todo:
+            frame = run.render(shot)
+            run.save_state(shot, frame)
+            yield frame
+            del frame  # before there is a next one
+    finally:
+        run.finish()
 
 
 def plan_sequence(

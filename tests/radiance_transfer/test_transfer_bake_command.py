@@ -13,6 +13,7 @@ from transfer_bake_tools import bake_of, court, random_bake
 
 import warp_gi as gi
 from warp_gi.cli import main as cli
+from warp_gi.files import machine
 from warp_gi.techniques.radiance_transfer import pictures
 from warp_gi.techniques.radiance_transfer.bake_tool import TOOL
 from warp_gi.techniques.radiance_transfer.textures import transfer_textures
@@ -180,7 +181,10 @@ def test_no_file_that_is_read_is_written_over(capfd, tmp_path, monkeypatch):
 
 def test_parts_that_a_killed_process_left_are_removed(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    left = [f".a.{end}.999999999.part" for end in ("exr", "rgba.exr", "glb", "json", "html", "safetensors")]
+    left = [
+        f".a.{end}.{machine()}-999999999-00000001.part"
+        for end in ("exr", "rgba.exr", "glb", "json", "html", "safetensors")
+    ]
     for name in left:
         (tmp_path / name).write_text("half")
     assert cli.main([*BAKE[:2], *FAST, "--export=a.exr", "--view=a.html", "-o=a.safetensors"]) == 0

@@ -9,7 +9,7 @@ import pytest
 from frame_tools import make_frame
 
 from warp_gi.errors import OptionError, SceneError
-from warp_gi.files import remove_stale_parts, replacing
+from warp_gi.files import machine, remove_stale_parts, replacing
 from warp_gi.sequence import frames as sequence
 from warp_gi.sequence.exr import read_exr, stored_format, write_exr
 from warp_gi.sequence.preview import tone_map
@@ -173,13 +173,28 @@ def test_stale_parts_go_and_living_ones_stay(tmp_path):
     path = tmp_path / "a.exr"
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
-    stale = tmp_path / f".a.exr.{dead.pid}.part"
-    living = tmp_path / f".a.exr.{os.getppid()}.part"
-    other = tmp_path / f".b.exr.{dead.pid}.part"
-    for file in (stale, living, other):
-        file.write_text("x")
-    remove_stale_parts(path)
-    assert sorted(tmp_path.iterdir()) == sorted([living, other])
+    here, there = machine(), "0123abcd"
+    stale = [f".a.exr.{here}-{dead.pid}-00000001.part", f".a.exr.{here}-{os.getpid()}-00000001.part"]
+    stale += [f".a.exr.{there}-{os.getpid()}-00000001.part"]  # of another container, a day old
+    kept = [f".a.exr.{here}-{os.getppid()}-00000001.part", f".b.exr.{here}-{dead.pid}-00000001.part"]
+    kept += [f".a.exr.{there}-{dead.pid}-00000002.part"]  # whose process cannot be asked for
+    for name in (*stale, *kept):
+        (tmp_path / name).write_text("x")
+    os.utime(tmp_path / stale[2], (0, 0))
+    with replacing(path) as part:  # of a thread of this process
+        part.write_text("new")
+        remove_stale_parts(path)
+        assert sorted(one.name for one in tmp_path.iterdir()) == sorted([*kept, part.name])
+    assert path.read_text() == "new"
+
+
+def test_two_writers_of_one_file_do_not_meet(tmp_path):
+    """Each has a temporary file of its own, whatever their process numbers are."""
+    path = tmp_path / "a.exr"
+    with replacing(path) as one, replacing(path) as other:
+        one.write_text("one")
+        other.write_text("other")
+    assert one != other and path.read_text() == "one" and list(tmp_path.iterdir()) == [path]
 
 
 def test_full_disk_is_one_error_and_no_file(tmp_path):

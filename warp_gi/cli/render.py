@@ -179,6 +179,8 @@ def run(options: Render, report: Reporter) -> None:
         times = render_shots(options, plan, sequence, report)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("finished frames are kept, --resume renders the others") from None
+    finally:
+        sequence.finish()
     count = f"{len(plan.todo)} frame{'s' * (len(plan.todo) != 1)}"
     report.line(f"{count} in {time.perf_counter() - started:.1f} s: {options.output}")
     if options.verbose and plan.todo:

@@ -218,7 +218,7 @@ class HasBuffers(Protocol):
 
 def write_preview(frame: HasBuffers, path: str | Path, exposure: float = 0.0) -> Path:
     """Write the tone-mapped beauty as PNG, from the values that the EXR stores; ``exposure`` is in stops."""
-    write_png(path, tone_map(stored_values("beauty", frame.numpy("beauty")), exposure))
+    write_png(path, tone_map(stored_values("beauty", frame.numpy("beauty")), exposure), exposure)
     return Path(path)
 
 

@@ -32,7 +32,8 @@ from warp_gi.sequence.frames import (
     write_frame,
     write_preview,
 )
-from warp_gi.sequence.preview import check_exposure
+from warp_gi.sequence.lock import Claim
+from warp_gi.sequence.preview import check_exposure, preview_exposure
 from warp_gi.sequence.state import Dependence
 
 if TYPE_CHECKING:
@@ -181,6 +182,7 @@ class SequenceRun:
 
     def __init__(self, scheduler: FrameScheduler, shots: Sequence[Shot], output: Output) -> None:
         self.scheduler, self.shots, self.output = scheduler, tuple(shots), output
+        self._claim: Claim | None = None
 
     def bake(self) -> None:
         """Bake under the sky of the sequence's first frame, so that a resumed sequence has the same bake."""
@@ -226,19 +228,27 @@ class SequenceRun:
     def prepare(self, plan: Plan) -> None:
         """Write previews that kept frames lack, make the folder, and remove what a killed run left there.
 
-        Raises OSError now, not after an hour's work, if nothing can be written.
+        Until ``finish`` no other process may write the same files. Raises OSError now, not after an hour's work, if
+        nothing can be written, OptionError if another process is writing them.
         """
         for shot in plan.done:
             preview = shot.path.with_suffix(".png")
-            if self.output.preview and not preview.exists():
+            if self.output.preview and preview_exposure(preview) != self.output.exposure:
                 write_preview(read_frame(shot.path), preview, self.output.exposure)
         if plan.todo:
             check_writable(self.output.pattern.parent)
+            self._claim = Claim(self.output.pattern, plan.frames, plan.dependence.is_saved and self.output.is_exr)
+            self._claim.take()
             remove_stale_parts(self.output.state_path)
         for shot in plan.todo:
             check_target(shot.path)
         if plan.done:
             _LOG.info("%d of %d frames are there already", len(plan.done), len(plan.shots))
+
+    def finish(self) -> None:
+        """Let other processes write the files again."""
+        if self._claim is not None:
+            self._claim.release()
 
     def with_samples(self, spp: int, frame_time: float) -> SequenceRun:
         """Return the same run with another number of samples a pixel, to ask about files."""
