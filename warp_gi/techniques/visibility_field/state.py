@@ -96,7 +96,7 @@ class FieldState:
         self.movers = scene.moving_objects
         """Node of each object that can move, by the object's number."""
         self.poses: list[np.ndarray] | None = None
-        """float64 [4, 4]: world matrix of each mover in the last frame; None before the first one."""
+        """What decides the vertices of each mover in the last frame, float64; None before the first one."""
         self.is_still = False
         """Whether nothing moved between the last two frames."""
         self.settled = SettledLayer.nothing(self.words)
@@ -292,7 +292,7 @@ class FieldState:
 
     def move(self, now: float) -> None:
         """Take note of where everything is at ``now`` [s], and drop the settled layer if anything moved."""
-        poses = [self.scene.world_from_node(node, now) for node in self.movers.values()]
+        poses = self.scene.shape_keys(self.movers.values(), now)
         moved = self.poses is None or any(not np.array_equal(a, b) for a, b in zip(poses, self.poses, strict=True))
         if moved and self.movers:
             self.settled = SettledLayer.nothing(self.words)
