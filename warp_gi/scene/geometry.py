@@ -39,6 +39,9 @@ class FlatGeometry:
     """Second set of texture coordinates, v up, float32 [vertex, 2]; None if no mesh has one."""
     vertex_starts: list[int]
     """First vertex of each node, and the number of vertices at the end."""
+    mean_areas: np.ndarray | None = None
+    """Area of each triangle as a mean over time, square metres, float64 [triangle]; None where no lamp changes its
+    shape, and those of the points count."""
 
 
 def check_nodes(nodes: Sequence[Node]) -> None:
@@ -102,9 +105,14 @@ def distinct_materials(nodes: Sequence[Node]) -> list[Material]:
 
 def surface_area(points: np.ndarray, indices: np.ndarray) -> float:
     """Return the area of triangles ``indices`` [n, 3] of ``points`` [m, 3], one side of each."""
+    return float(triangle_areas(points, indices).sum())
+
+
+def triangle_areas(points: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Return the area of each of the triangles ``indices`` [n, 3] of ``points`` [m, 3], float64 [n]."""
     corners = points[indices].astype(np.float64)
     sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return float((0.5 * np.linalg.norm(sides, axis=1)).sum())
+    return 0.5 * np.linalg.norm(sides, axis=1)
 
 
 def flatten(nodes: Sequence[Node], materials: Sequence[Material], poses: Sequence[Pose]) -> FlatGeometry:

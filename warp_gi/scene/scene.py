@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 POSES_FOR_BOUNDS = 33
 """Number of evenly spaced poses, beside those of the keyframes, that the bounds of an animated scene enclose."""
 
+POSES_FOR_AREAS = 9
+"""Number of evenly spaced poses over which areas of lamps that change their shape are averaged."""
+
 
 class Scene:
     """A scene: everything that is rendered. Lengths in metres, y up, colours linear Rec. 709.
@@ -89,6 +92,8 @@ class Scene:
         self._hulls = hulls.hulls_of(self.nodes, self._moving)
         if not np.isfinite(self._flat.points).all():
             raise SceneError(f"scene {self.name!r}: node transforms move vertices past the range of float32")
+        times = np.linspace(0.0, self.duration, POSES_FOR_AREAS)
+        self._flat.mean_areas = emitters.mean_areas(self.nodes, self._flat, self._hulls, times)
         self._emissive, self._triangle_powers = emitters.emissive_triangles(self._flat, self.materials)
         self._bounds = self._all_bounds()
         self._devices: dict[str, DeviceScene] = {}
@@ -276,10 +281,10 @@ class Scene:
         points = animation.box_corners(self.nodes[index]) @ pose.matrix[:3, :3].T + pose.matrix[:3, 3]
         return np.stack([points.min(axis=0), points.max(axis=0)])
 
-    def shape_keys(self, indices: Iterable[int], time: float) -> list[np.ndarray]:
-        """Return numbers of each node, float64 [number]: with the same ones its meshes are where they were, and as."""
+    def shape_key(self, indices: Iterable[int], time: float) -> np.ndarray:
+        """Return what decides where the vertices of nodes are at ``time`` [s], and their placements, float64 [n]."""
         placed = poses.poses(self.nodes, time)
-        return [placed[index].key for index in indices]
+        return np.concatenate([np.zeros(0), *(placed[index].key for index in indices)])
 
     def world_from_node(self, index: int, time: float) -> np.ndarray:
         """Return the placement of node ``index`` at ``time`` [s], float64 [4, 4]."""
