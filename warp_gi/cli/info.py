@@ -71,6 +71,7 @@ def summary(scene: Scene) -> list[tuple[str, object]]:
         ("vertices", sum(len(mesh.points) for mesh in meshes)),
         ("meshes", len(meshes)),
         ("objects", len(scene.object_names)),
+        *_deforming(scene),
         ("materials", len(scene.materials)),
         ("textures", len(distinct_textures(scene.materials))),
         ("emissive triangles", scene.emitter_count - len(scene.lights)),
@@ -84,6 +85,19 @@ def summary(scene: Scene) -> list[tuple[str, object]]:
         ("highest corner [m]", _numbers(high)),
         ("memory [MB]", scene.memory_bytes / 1e6),
         ("hash", scene.hash[:16]),
+    ]
+
+
+def _deforming(scene: Scene) -> list[tuple[str, object]]:
+    """Return what there is of skins and morph targets."""
+    skins = {id(node.skin): node.skin for node in scene.nodes if node.skin is not None and node.meshes}
+    bent = sum(node.skin is not None for node in scene.nodes if node.meshes)
+    morphing = [node for node in scene.nodes if node.morphs is not None]
+    targets = sum(len(node.morphs[0].weights) for node in morphing if node.morphs)
+    joints = sum(len(skin.joints) for skin in skins.values())
+    return [
+        *([("objects with a skin", f"{bent} ({joints} joints in {len(skins)} skins)")] if bent else []),
+        *([("objects whose shape is animated", f"{len(morphing)} ({targets} morph targets)")] if morphing else []),
     ]
 
 

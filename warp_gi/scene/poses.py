@@ -140,9 +140,13 @@ def joint_shares(mesh: Mesh) -> np.ndarray:
 def _blended(mesh: Mesh, joints: np.ndarray) -> np.ndarray:
     """Return the weighted mean of each vertex's joint matrices, float64 [vertex, 3, 4]."""
     rows, shares, of = joints[:, :3].reshape(-1, 12), joint_shares(mesh), np.asarray(mesh.joints)
-    blend = shares[:, :1] * rows[of[:, 0]]
-    for k in range(1, of.shape[1]):
-        blend += shares[:, k : k + 1] * rows[of[:, k]]
+    blend, part = np.empty((len(of), 12)), np.empty((len(of), 12))
+    for k in range(of.shape[1]):
+        target = part if k else blend
+        np.take(rows, of[:, k], axis=0, out=target, mode="clip")  # into a buffer: faster than rows[of[:, k]]
+        target *= shares[:, k : k + 1]
+        if k:
+            blend += part
     return blend.reshape(-1, 3, 4)
 
 
