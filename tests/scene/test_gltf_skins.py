@@ -145,6 +145,19 @@ def test_scale_axis_and_offset_of_a_file_take_skins_along(tmp_path):
     np.testing.assert_allclose(upright, here[:, [0, 2, 1]] * (1, 1, -1), atol=1e-6)
 
 
+def test_joints_at_the_origin_of_a_file_that_lies_far_away(tmp_path):
+    """Roots without placement, of which nothing hangs: their offset is in the inverse bind matrices alone."""
+    glb = skinned_bar()
+    far = np.array([400000.0, 0, 0])
+    matrices = np.stack([placement(translation=far)] * 2).transpose(0, 2, 1).reshape(-1, 16)
+    glb.json["skins"][0]["inverseBindMatrices"] = glb.accessor(matrices)
+    glb.json["nodes"] = [{"mesh": 0, "skin": 0}, {"name": "a"}, {"name": "b"}]
+    glb.json["scenes"] = [{"nodes": [0, 1, 2]}]
+    with pytest.warns(UserWarning, match="recentred by"):
+        scene = gi.load_scene(glb.write(tmp_path / "far.glb"))
+    np.testing.assert_allclose(shape(scene)[0].astype(float) + scene.offset, POINTS + far, atol=1e-6)
+
+
 def test_smooth_normals_of_a_skinned_mesh_bend_with_it(tmp_path):
     glb = skinned_bar(root=ROOT, upper=UPPER)
     del glb.json["meshes"][0]["primitives"][0]["attributes"]["NORMAL"]

@@ -10,7 +10,9 @@ from scene_tools import card, triangle
 
 import warp_gi as gi
 from warp_gi.errors import SceneError
-from warp_gi.scene import hulls, poses
+from warp_gi.launch import get_device
+from warp_gi.scene import geometry, hulls, poses
+from warp_gi.techniques.surface_cache.fill import object_grids
 
 KEYS = [gi.MorphKeyframe(0.0, (0.0,)), gi.MorphKeyframe(2.0, (1.0,))]
 
@@ -180,10 +182,43 @@ def test_an_interrupted_move_places_everything_anew(monkeypatch):
     ]
     scene.update(1.5, 0.5, "cpu")
     with monkeypatch.context() as patch:
-        patch.setattr("warp_gi.scene.geometry.place", lambda *a: (_ for _ in ()).throw(KeyboardInterrupt))
+        placed = geometry.place
+
+        def stops(*arguments):
+            placed(*arguments)
+            raise KeyboardInterrupt
+
+        patch.setattr(geometry, "place", stops)
         with pytest.raises(KeyboardInterrupt):
             scene.update(1.0, 0.5, "cpu")
+    assert scene.update(1.5, 0.5, "cpu")  # the pose before the interrupt: it is no longer there
     scene.update(0.5, 0.25, "cpu")
     g = scene.data("cpu").geometry
     np.testing.assert_array_equal(g.points.numpy(), wanted[0])
     np.testing.assert_array_equal(g.previous_points.numpy(), wanted[1])
+
+
+def test_a_vertex_without_weights_follows_its_first_joint():
+    nodes = flag()
+    nodes[0].meshes[0].joints = np.int32([[1, 0]] * 3)
+    nodes[0].meshes[0].joint_weights = np.zeros((3, 2), np.float32)
+    nodes[0].morphs = None
+    scene = gi.Scene(nodes)
+    scene.update(1.0, None, "cpu")
+    points = scene.data("cpu").geometry.points.numpy()[:3]
+    np.testing.assert_allclose(points, [[0, 1, 0], [0, 2, 0], [-1, 1, 0]], atol=1e-6)  # a quarter turn, 1 m up
+
+
+def test_the_placement_of_a_skinned_node_is_of_no_account():
+    """Neither for its vertices and bounds, nor for its cells in a surface cache."""
+    nodes, moved = flag(), flag()
+    moved[0].keyframes = [gi.Keyframe(0.0, (5, 0, 0)), gi.Keyframe(1.0, (0, 9, 0), scale=(3, 3, 3))]
+    a, b = gi.Scene(nodes), gi.Scene(moved)
+    np.testing.assert_array_equal(a.bounds, b.bounds)
+    for scene in (a, b):
+        scene.update(0.7, 0.2, "cpu")
+        (row,) = (row for row in object_grids(scene, 0.7, get_device("cpu")).numpy() if row["number"])
+        np.testing.assert_array_equal(row["rest_from_world"], np.eye(4))
+    for name in ("points", "previous_points", "normals"):
+        one, other = (getattr(scene.data("cpu").geometry, name).numpy() for scene in (a, b))
+        np.testing.assert_array_equal(one, other)

@@ -11,9 +11,11 @@ import statistics_tools as st
 from deforming_tools import BINDS, bar, bar_weights, bent, placement, turn, turned_at
 from scene_tools import quad
 from test_dependence import preset
+from truth_tools import camera_in_box, closed_box
 
 import warp_gi as gi
 from warp_gi.scene.model import Mesh
+from warp_gi.techniques.light_field.estimator import _key as light_of_probes
 
 POINTS, NORMALS, FACES = bar()
 SHARES = bar_weights(POINTS)
@@ -155,6 +157,59 @@ def test_a_preset_sees_and_lights_what_deforms(name, reference):
     for which in (ids >= 0, ids == 1, ids == 2):
         mean, expected = found[which].mean(dtype=np.float64), wanted[which].mean(dtype=np.float64)
         assert mean == pytest.approx(expected, rel=ERRORS.get(name, 0.04))
+
+
+def only_bends():
+    """The room without the square, and the bar in it."""
+    nodes = room().nodes[:4]
+    return gi.Scene(nodes, environment=(0.4, 0.5, 0.6), name="bends")
+
+
+def test_a_field_knows_that_what_bends_does_not_rest():
+    """Cells that are baked with it where it rests must not outlive the frame in which it bends again."""
+    scene = only_bends()
+    times = gi.CameraPath.from_cameras([view()] * 8, fps=FPS)  # it bends until frame 4
+    scheduler = gi.FrameScheduler(scene, times, preset("dvf"), st.device().alias, 3)
+    stills, settled = [], []
+    for index in (0, 1, 5, 6, 7, 2):
+        scheduler.frame(index)
+        state = scheduler.state("environment")
+        stills.append(state.is_still)
+        settled.append(len(state.settled.cells) > 0)
+    assert stills == [False, False, False, True, True, False]
+    assert settled == [False, False, False, True, True, False]
+
+
+def test_probes_are_traced_again_while_something_bends():
+    scene = only_bends()
+    keys = [light_of_probes(scene, time) for time in (0.0, 0.5, 1.0, 2.0)]
+    assert keys[0] != keys[1] != keys[2] == keys[3]
+
+
+def test_a_furnace_stays_white_while_a_bar_bends_in_it():
+    """Every cell of the surface cache has the irradiance pi / (1 - albedo) = 2 pi; the bar has cells of its own."""
+    sides = closed_box(0.5, 1.0)
+    tube = replace(only_bends().nodes[1].meshes[0], material=sides[0].material)
+    tube.points = (0.5 * tube.points).astype(np.float32)
+    skin = gi.Skin([2, 3], np.stack([np.eye(4), placement(translation=(0, -0.5, 0))]))
+    keys = [gi.Keyframe(time, (0, 0.5, 0), tuple(rotation)) for time, rotation in TURNS]
+    nodes = [gi.Node("box", sides), gi.Node("bar", [tube], skin=skin)]
+    nodes += [gi.Node("low", parent_from_node=placement(translation=(-0.2, -0.8, -0.4)))]
+    scene = gi.Scene([*nodes, gi.Node("high", parent=2, keyframes=keys)])
+    cache = gi.SurfaceCache(paths=20_000, refresh=4_000)
+    ends_in = gi.BsdfPaths(ends_in=cache)
+    pipeline = gi.Pipeline(environment=None, emitters=None, indirect=ends_in, camera_samples=1, spp=4)
+    camera = gi.CameraPath.from_cameras([camera_in_box((24, 24))] * 4, fps=FPS)
+    scheduler = gi.FrameScheduler(scene, camera, pipeline, st.device().alias, 3)
+    for index in range(4):
+        scheduler.frame(index)
+        state = scheduler.state("indirect.ends_in")
+        number = state.keys >> np.uint64(55)
+        assert set(number) == {0, 2}
+        for which in (0, 2):
+            mine = number == which
+            mean = state.light[mine, :3].sum(axis=0) / state.weights[mine].sum()
+            np.testing.assert_allclose(mean, 2 * np.pi, rtol=0.03)
 
 
 # ---- lamps ----
