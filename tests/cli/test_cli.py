@@ -447,7 +447,7 @@ def test_info_names_skins_and_morph_targets(tmp_path, capsys):
     assert cli.main(["info", str(glb.write(tmp_path / "bar.glb"))]) == 0
     told = " ".join(capsys.readouterr().out.split())
     assert "objects with a skin 1 (2 joints in 1 skins)" in told
-    assert "objects whose shape is animated 1 (2 morph targets)" in told and "ignored" not in told
+    assert "objects that morph 1 (2 morph targets)" in told and "ignored" not in told
 
 
 def test_info(capsys):

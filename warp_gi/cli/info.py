@@ -97,7 +97,7 @@ def _deforming(scene: Scene) -> list[tuple[str, object]]:
     joints = sum(len(skin.joints) for skin in skins.values())
     return [
         *([("objects with a skin", f"{bent} ({joints} joints in {len(skins)} skins)")] if bent else []),
-        *([("objects whose shape is animated", f"{len(morphing)} ({targets} morph targets)")] if morphing else []),
+        *([("objects that morph", f"{len(morphing)} ({targets} morph targets)")] if morphing else []),
     ]
 
 
