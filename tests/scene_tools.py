@@ -94,7 +94,7 @@ class GlbBuilder:
             "bufferView": self.view(values.tobytes()),
             "componentType": codes[np.dtype(dtype).str[1:]],
             "count": len(values),
-            "type": {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}[width],
+            "type": {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}[width],
             **fields,
         }
         self.json["accessors"].append(accessor)

@@ -170,6 +170,7 @@ def test_what_is_no_whole_number_is_refused(frames):
 def kept_levels():
     log = logging.getLogger("warp_gi")
     before, handlers, level = wp.config.log_level, list(log.handlers), log.level
+    log.handlers[:] = []  # those of commands
     yield
     wp.config.log_level, log.handlers[:] = before, handlers
     log.setLevel(level)

@@ -38,8 +38,11 @@ from warp_gi.scene.loading import load_scene as load_scene
 from warp_gi.scene.model import Keyframe as Keyframe
 from warp_gi.scene.model import Material as Material
 from warp_gi.scene.model import Mesh as Mesh
+from warp_gi.scene.model import MorphKeyframe as MorphKeyframe
+from warp_gi.scene.model import MorphTarget as MorphTarget
 from warp_gi.scene.model import Node as Node
 from warp_gi.scene.model import PunctualLight as PunctualLight
+from warp_gi.scene.model import Skin as Skin
 from warp_gi.scene.model import Texture as Texture
 from warp_gi.scene.pinhole import Camera as Camera
 from warp_gi.scene.scene import Scene as Scene

@@ -13,6 +13,7 @@ import time
 import numpy as np
 import pytest
 import trimesh
+from deforming_tools import animate, bar, skinned_bar
 from scene_tools import GlbBuilder
 
 from warp_gi.cli import main as cli
@@ -450,6 +451,17 @@ def test_compare_refuses(unbroken, tmp_path, capsys):
         assert cli.main(["compare", str(a), str(b), *extra]) == 2
         error = capsys.readouterr().err
         assert words in error and error.count("\n") == 1
+
+
+def test_info_names_skins_and_morph_targets(tmp_path, capsys):
+    glb = skinned_bar()
+    target = {"POSITION": glb.accessor(np.zeros((len(bar()[0]), 3)))}
+    glb.json["meshes"][0]["primitives"][0]["targets"] = [target, target]
+    animate(glb, 0, "weights", [0, 1], [[0, 0], [1, 0]])
+    assert cli.main(["info", str(glb.write(tmp_path / "bar.glb"))]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "objects with a skin 1 (2 joints in 1 skins)" in told
+    assert "objects that morph 1 (2 morph targets)" in told and "ignored" not in told
 
 
 def test_info(capsys):

@@ -82,18 +82,23 @@ def blend(glb):
     glb.json["materials"][0]["alphaMode"] = "BLEND"
 
 
-def weights_move(glb):
-    sampler = {"input": glb.accessor([0.0, 1.0]), "output": glb.accessor([0.0, 1.0])}
-    channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
-    glb.add("animations", {"name": "wink", "samplers": [sampler], "channels": [channel]})
+def instances_of_a_skin(glb):
+    attributes = glb.json["meshes"][0]["primitives"][0]["attributes"]
+    attributes["JOINTS_0"], attributes["WEIGHTS_0"] = (
+        glb.accessor(np.zeros((3, 4)), np.uint8),
+        glb.accessor(np.ones((3, 4))),
+    )
+    glb.add("skins", {"joints": [0]})
+    places = glb.accessor(np.zeros((2, 3)))
+    glb.json["nodes"][0]["skin"] = 0
+    glb.json["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": places}}}
 
 
 USES = {
     "COLOR_1": (attribute("COLOR_1", 3), r"COLOR_1 and above \(mesh 'tri'\)"),
     "points": (points, r"points and lines \(mesh 'tri'\)"),
     "blend": (blend, r"alphaMode BLEND \(material 'm'\), which is approximated"),
-    "weights": (weights_move, r"animation of morph weights \(animation 'wink'\)"),
-    "skin": (lambda glb: glb.json["nodes"][0].update(skin=0), r"skins \(node 'n'\)"),
+    "instances": (instances_of_a_skin, r"instances of meshes with a skin \(node 'n'\)"),
 }
 
 

@@ -24,7 +24,10 @@ PROBES = gi.LightFieldProbes(counts=(2, 1, 2), resolution=16, irradiance_resolut
 
 
 def yard(moving):
-    """A floor, a wall, a canopy and two lamps; a plate and one of the lamps move, if at all, until frame 2."""
+    """A floor, a wall, a canopy and two lamps; a plate and one of the lamps move, if at all, until frame 2.
+
+    A cloth hangs between the floor and the plate, and bends as that moves.
+    """
     grey = gi.Material("grey", (0.7, 0.6, 0.5), roughness=0.4)
     lamp = gi.Material("lamp", emission=(6.0, 5.0, 4.0), double_sided=True)
     rests = [
@@ -36,6 +39,12 @@ def yard(moving):
     plate = [quad((-0.5, 0, 0.5), (1, 0, 0), (0, 0, -1), grey), quad((-0.1, -0.2, 0.1), (0.2, 0, 0), (0, 0.2, 0), lamp)]
     nodes = [gi.Node("yard", rests), gi.Node("plate", plate)]
     nodes[1].parent_from_node[:3, 3] = (0.4, 1.0, 0.6)
+    if moving:
+        cloth = quad((-0.5, 0.1, 0.3), (0.8, 0, 0), (0, 0.6, 0), grey)
+        cloth.joints, cloth.joint_weights = np.int32([[0, 1]] * 4), np.float32([[1, 0], [1, 0], [0.5, 0.5], [0.2, 0.8]])
+        cloth.targets = [gi.MorphTarget(np.float32([[0, 0, 0], [0, 0, 0], [0, 0, 0.4], [0, 0.2, 0]]))]
+        morphs = [gi.MorphKeyframe(0.0, (0.0,)), gi.MorphKeyframe(0.5, (1.0,))]
+        nodes.append(gi.Node("cloth", [cloth], skin=gi.Skin([0, 1], np.stack([np.eye(4)] * 2)), morphs=morphs))
     scene = gi.Scene(nodes, environment=sky())
     if moving:
         scene.animate("plate", [gi.Keyframe(0.0, (0.9, 1.4, 0.9)), gi.Keyframe(0.5, (-0.6, 0.7, 0.8))])

@@ -72,6 +72,7 @@ def summary(scene: Scene) -> list[tuple[str, object]]:
         ("meshes", len(meshes)),
         *_shared(meshes),
         ("objects", len(scene.object_names)),
+        *_deforming(scene),
         ("materials", len(scene.materials)),
         ("textures", len(distinct_textures(scene.materials))),
         ("emissive triangles", scene.emitter_count - len(scene.lights)),
@@ -96,6 +97,19 @@ def _shared(meshes: Sequence[Mesh]) -> list[tuple[str, object]]:
         return []
     needed, all_of_them = (sum(len(mesh.indices) for mesh in some) for some in (once.values(), meshes))
     return [("copies of shared meshes", f"{len(meshes) - len(once)}, with {all_of_them - needed} of the triangles")]
+
+
+def _deforming(scene: Scene) -> list[tuple[str, object]]:
+    """Return what there is of skins and morph targets."""
+    skins = {id(node.skin): node.skin for node in scene.nodes if node.skin is not None and node.meshes}
+    bent = sum(node.skin is not None for node in scene.nodes if node.meshes)
+    morphing = [node for node in scene.nodes if node.morphs is not None]
+    targets = sum(len(node.morphs[0].weights) for node in morphing if node.morphs)
+    joints = sum(len(skin.joints) for skin in skins.values())
+    return [
+        *([("objects with a skin", f"{bent} ({joints} joints in {len(skins)} skins)")] if bent else []),
+        *([("objects that morph", f"{len(morphing)} ({targets} morph targets)")] if morphing else []),
+    ]
 
 
 def _material_row(material: Material) -> tuple[object, ...]:

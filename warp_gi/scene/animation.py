@@ -144,7 +144,7 @@ def box_corners(node: Node) -> np.ndarray:
 
 
 def swept_box(nodes: Sequence[Node], moving: Sequence[bool], evenly: np.ndarray) -> np.ndarray:
-    """Return a box around the poses of moving meshes: low and high corner, float64 [2, 3].
+    """Return a box around the poses of moving meshes that keep their shape: low and high corner, float64 [2, 3].
 
     The poses are those at the keys of whatever moves together, and at the times ``evenly`` [s].
     """
@@ -157,7 +157,7 @@ def swept_box(nodes: Sequence[Node], moving: Sequence[bool], evenly: np.ndarray)
             groups.setdefault(top[index], []).append(index)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for group in groups.values():
-        if any(nodes[index].meshes for index in group):
+        if any(nodes[index].meshes and _is_rigid(nodes[index]) for index in group):
             times = np.union1d(evenly, key_times([nodes[index] for index in group]))
             step = max(POSES_AT_ONCE // len(group), 16)
             for start in range(0, len(times), step):
@@ -168,8 +168,30 @@ def swept_box(nodes: Sequence[Node], moving: Sequence[bool], evenly: np.ndarray)
 
 def _group_box(nodes: Sequence[Node], group: list[int], rest: list[np.ndarray], times: np.ndarray) -> np.ndarray:
     """Return a box around all meshes of a group of nodes at all ``times`` [s]; ``rest`` places what does not move."""
-    world: dict[int, np.ndarray] = {}
+    world = world_at_times(nodes, group, times, rest)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for index in group:
+        node = nodes[index]
+        if _is_rigid(node) and any(len(mesh.points) for mesh in node.meshes):
+            matrices = world[index].reshape(-1, 4, 4)
+            points = np.matmul(box_corners(node), matrices[:, :3, :3].transpose(0, 2, 1)) + matrices[:, None, :3, 3]
+            low, high = np.minimum(low, points.min(axis=(0, 1))), np.maximum(high, points.max(axis=(0, 1)))
+    return np.stack([low, high])
+
+
+def _is_rigid(node: Node) -> bool:
+    """Return whether the meshes of a node keep their shape."""
+    return node.skin is None and node.morphs is None
+
+
+def world_at_times(
+    nodes: Sequence[Node], group: Sequence[int], times: np.ndarray, rest: Sequence[np.ndarray] = ()
+) -> dict[int, np.ndarray]:
+    """Return world_from_node of a group at ``times`` [s], float64 [time, 4, 4], or [4, 4] of a node that rests.
+
+    Parents stand before children in the group; those that are not in it are where ``rest`` has them.
+    """
+    world: dict[int, np.ndarray] = {}
     for index in group:
         node = nodes[index]
         keys = node.keyframes
@@ -177,11 +199,7 @@ def _group_box(nodes: Sequence[Node], group: list[int], rest: list[np.ndarray], 
         if node.parent is not None:
             placed = (world[node.parent] if node.parent in world else rest[node.parent]) @ placed
         world[index] = placed
-        if any(len(mesh.points) for mesh in node.meshes):
-            matrices = placed.reshape(-1, 4, 4)
-            points = np.matmul(box_corners(node), matrices[:, :3, :3].transpose(0, 2, 1)) + matrices[:, None, :3, 3]
-            low, high = np.minimum(low, points.min(axis=(0, 1))), np.maximum(high, points.max(axis=(0, 1)))
-    return np.stack([low, high])
+    return world
 
 
 def moving_nodes(nodes: Sequence[Node]) -> list[bool]:
@@ -194,7 +212,7 @@ def moving_nodes(nodes: Sequence[Node]) -> list[bool]:
 
 def key_times(nodes: Sequence[Node]) -> list[float]:
     """Return the times of all keyframes, sorted, without repeats [s]."""
-    return sorted({key.time for node in nodes for key in node.keyframes or ()})
+    return sorted({key.time for node in nodes for key in (*(node.keyframes or ()), *(node.morphs or ()))})
 
 
 def check_keyframes(keyframes: Sequence[Keyframe], name: str) -> None:

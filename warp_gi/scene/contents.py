@@ -9,6 +9,7 @@ import numpy as np
 
 from warp_gi.scene.geometry import FlatGeometry
 from warp_gi.scene.model import Material, Node, PunctualLight
+from warp_gi.scene.poses import Pose
 
 if TYPE_CHECKING:
     from warp_gi.scene.environment import Environment
@@ -27,8 +28,8 @@ class SceneContents(Protocol):
     """Indices of the triangles that emit, int64 [emissive triangle]."""
     _moving: list[bool]
     """Whether each node moves, by its index."""
-    _world: list[np.ndarray]
-    """Placement of each node at time 0, float64 [4, 4]."""
+    _poses: list[Pose]
+    """Pose of each node at time 0."""
 
     @property
     def _devices(self) -> Mapping[str, Any]:

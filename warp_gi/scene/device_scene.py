@@ -14,6 +14,7 @@ from warp_gi.errors import SceneError
 from warp_gi.kernels import types
 from warp_gi.launch import on_device
 from warp_gi.scene import animation, emitters, geometry, textures
+from warp_gi.scene.poses import Pose, poses
 
 if TYPE_CHECKING:
     from warp_gi.bvh import AlphaMasks, TriangleBvh
@@ -29,7 +30,7 @@ class DeviceScene:
         from warp_gi.scene.masks import alpha_masks
 
         self.scene, self.device = scene, device
-        self.world = self.previous_world = scene._world
+        self.poses = self.previous_poses = scene._poses
         flat = scene._flat
         if scene.is_animated:
             flat = replace(flat, points=flat.points.copy(), normals=flat.normals.copy())
@@ -111,30 +112,29 @@ class DeviceScene:
     def move(self, time: float, previous_time: float) -> bool:
         """Bring points, normals and lights to ``time`` and previous points to ``previous_time``."""
         nodes, flat, target = self.scene.nodes, self.flat, self.data.geometry
-        world = animation.world_matrices(nodes, time)
-        previous_world = animation.world_matrices(nodes, previous_time)
-        was, was_before = self.world, self.previous_world
+        now = poses(nodes, time)
+        before = now if previous_time == time else poses(nodes, previous_time)
+        was, was_before = self.poses, self.previous_poses
         # No pose is known until everything is moved: the call after an interrupt or a fork then places all nodes.
-        self.world = self.previous_world = [np.full((4, 4), np.nan)] * len(nodes)
+        self.poses = self.previous_poses = [Pose(np.full((4, 4), np.nan))] * len(nodes)
         moved = changed = False
         for index, node in enumerate(nodes):
             start, stop = flat.vertex_starts[index : index + 2]
             if start == stop or not self.scene._moving[index]:
                 continue
-            if not np.array_equal(previous_world[index], was_before[index]):
-                vertex = start
-                for mesh in node.meshes:
-                    end = vertex + len(mesh.points)
-                    self.previous_points[vertex:end] = geometry.transform_points(previous_world[index], mesh.points)
-                    vertex = end
+            if not np.array_equal(before[index].key, was_before[index].key):
+                stood = np.array_equal(before[index].key, was[index].key)  # mostly: the frame before was the last one
+                points = flat.points[start:stop] if stood else geometry.placed_points(node, before[index])
+                self.previous_points[start:stop] = points
                 self._upload(target.previous_points, self.previous_points, start, stop)
                 changed = True
-            if not np.array_equal(world[index], was[index]):
-                geometry.place(flat, node, world[index], start)
+            if not np.array_equal(now[index].key, was[index].key):
+                geometry.place(flat, node, now[index], start)
                 self._upload(target.points, flat.points, start, stop)
                 self._upload(target.normals, flat.normals, start, stop)
                 moved = True
         if any(light.node is not None and self.scene._moving[light.node] for light in self.scene.lights):
+            world = [pose.matrix for pose in now]
             table = emitters.emitter_table(self.scene._emissive, self.scene.lights, world)
             changed |= not np.array_equal(table, self.emitters)
             self.emitters[:] = table
@@ -142,7 +142,7 @@ class DeviceScene:
         if moved:
             self.bvh.refit(flat.points)
             self._bound_emitters(self.data.emitters)
-        self.world, self.previous_world = world, previous_world
+        self.poses, self.previous_poses = now, before
         return moved or changed
 
     def _bound_emitters(self, target: types.Emitters) -> None:

@@ -16,17 +16,22 @@ import numpy as np
 
 from warp_gi.errors import SceneError
 from warp_gi.scene import animation, emitters, geometry, textures
-from warp_gi.scene.model import Material, Mesh, Node, PunctualLight, Texture
+from warp_gi.scene.hashing import shape_hash
+from warp_gi.scene.material_copies import alike, row_edit
+from warp_gi.scene.model import Material, Mesh, MorphTarget, Node, PunctualLight, Skin, Texture
+from warp_gi.scene.poses import deforms, joint_matrices
 from warp_gi.scene.watching import Change, Owner, Watch
 
 if TYPE_CHECKING:
-    from warp_gi.kernels import types
     from warp_gi.scene.contents import SceneContents
     from warp_gi.scene.sky_map import SkyMap
 
 NEW_SCENE = "make a new scene: gi.Scene(scene.nodes, scene.lights, scene.environment, scene.cameras)"
 NEW_SKY = "assign it again: scene.environment = ..."
 
+
+SHAPE_FIELDS = ("skin", "morphs", "joints", "joint_weights", "targets", "joint_from_mesh")
+"""Fields of nodes, meshes and skins that change the shape of meshes."""
 
 Item = TypeVar("Item", Material, Mesh, Node, PunctualLight)
 
@@ -55,6 +60,7 @@ class Edits:
         self.scene = scene
         self.nodes = list(scene.nodes)
         self.slots = _slots(scene)
+        self.shapes = {index: _shape_of(node) for index, node in enumerate(scene.nodes) if deforms(node)}
         self.materials = list(scene.materials)
         self.material_count = len(scene.materials)
         self.emissions = _emissions(scene.materials)
@@ -100,6 +106,8 @@ class Edits:
 
     def _edit(self, change: Change) -> Edit | None:
         owner, field = change
+        if field in SHAPE_FIELDS or isinstance(owner, Skin | MorphTarget):
+            return self._shape_edit(field)
         if isinstance(owner, Node):
             return self._meshes_edit(owner) if field == "meshes" else self._placement_edit(owner, field)
         if isinstance(owner, Mesh):
@@ -153,10 +161,25 @@ class Edits:
                 under.add(place)
             if place not in under or scene._moving[place]:
                 continue
-            if self.slots[place] and (moving[place] or not np.array_equal(world[place], scene._world[place])):
+            is_other = moving[place] or not np.array_equal(world[place], scene._poses[place].matrix)
+            if self.slots[place] and nodes[place].skin is None and is_other:
                 return edit
             if place in lit and (moving[place] or not np.array_equal(world[place], self.light_world[place])):
                 return edit
+        for place, one in enumerate(nodes):
+            bent = one.skin is not None and self.slots[place] and not scene._moving[place]
+            if one.skin is not None and bent and under.intersection(one.skin.joints):
+                old = scene._poses[place].joints
+                is_same = old is not None and np.array_equal(joint_matrices(one.skin, world), old)
+                if not is_same or any(moving[joint] for joint in one.skin.joints):
+                    return edit
+        return None
+
+    def _shape_edit(self, field: str) -> Edit | None:
+        """Return whether what changes the shape of meshes is other than it was."""
+        for index, node in enumerate(self.scene.nodes):
+            if _shape_of(node) != self.shapes.get(index):
+                return Edit(f"{field} of what bends node {index} {node.name!r} changed")
         return None
 
     def _meshes_edit(self, node: Node) -> Edit | None:
@@ -193,7 +216,7 @@ class Edits:
         except (ValueError, TypeError):
             return hint
         flat = self.scene._flat
-        part = geometry.flatten([Node("", [mesh])], [mesh.material], [self.scene._world[index]])
+        part = geometry.flatten([Node("", [mesh])], [mesh.material], [self.scene._poses[index]])
         part.indices += slot.vertices.start
         for field, place in (
             ("points", slot.vertices),
@@ -206,7 +229,7 @@ class Edits:
             if not geometry.is_copy(field, getattr(part, field), getattr(flat, field), place):
                 return field
         used = len(part.indices) and slot.row < len(self.scene.materials)
-        return "material" if used and not _alike(mesh.material, self.scene.materials[slot.row]) else None
+        return "material" if used and not alike(mesh.material, self.scene.materials[slot.row]) else None
 
     # ---- shading ----
 
@@ -220,7 +243,7 @@ class Edits:
             return None  # read later
         data = next(iter(scene._devices.values())).data
         for row, (material, old) in enumerate(zip(now, self.materials, strict=False)):
-            if material is not old and _row_edit(material, data, row, "a field"):
+            if material is not old and row_edit(material, data, row, "a field"):
                 return Edit(f"material {row} {old.name!r} was replaced in scene.materials", cure)
         return None
 
@@ -232,9 +255,9 @@ class Edits:
         data = next(iter(scene._devices.values())).data
         for row, candidate in enumerate(scene.materials[: self.material_count]):
             if field is None and candidate is material:
-                field = _row_edit(material, data, row, hint)
+                field = row_edit(material, data, row, hint)
         for _, mesh, slot in self._meshes():
-            if field is None and mesh.material is material and not _alike(material, scene.materials[slot.row]):
+            if field is None and mesh.material is material and not alike(material, scene.materials[slot.row]):
                 field = hint  # meshes have this material in place of the scene's own
         return None if field is None else Edit(f"{field} of material {material.name!r} changed")
 
@@ -301,7 +324,9 @@ class Edits:
 def _geometry(scene: SceneContents) -> list[Owner]:
     """Return what the flat geometry of a scene is made from."""
     meshes = {id(mesh): mesh for node in scene.nodes for mesh in node.meshes}
-    return [(scene, ("nodes", "materials")), *scene.nodes, *meshes.values()]
+    skins = {id(node.skin): node.skin for node in scene.nodes if node.skin is not None}
+    targets = [target for mesh in meshes.values() for target in mesh.targets]
+    return [(scene, ("nodes", "materials")), *scene.nodes, *meshes.values(), *skins.values(), *targets]
 
 
 def _shading(scene: SceneContents) -> list[Owner]:
@@ -309,6 +334,14 @@ def _shading(scene: SceneContents) -> list[Owner]:
     used = [*scene.materials, *(mesh.material for node in scene.nodes for mesh in node.meshes)]
     materials = list({id(material): material for material in used}.values())
     return [(scene, ("lights", "materials")), *materials, *textures.distinct_textures(materials), *scene.lights]
+
+
+def _shape_of(node: Node) -> str | None:
+    """Return what changes the shape of a node's meshes; None if nothing does."""
+    try:
+        return shape_hash(node) if deforms(node) else None
+    except (TypeError, ValueError, AttributeError):
+        return "unusable"
 
 
 def _slots(scene: SceneContents) -> list[list[_Slot]]:
@@ -324,43 +357,6 @@ def _slots(scene: SceneContents) -> list[list[_Slot]]:
             slots[-1].append(_Slot(mesh, vertices, triangles, rows[id(mesh.material)]))
             vertex, triangle = vertices.stop, triangles.stop
     return slots
-
-
-def _row_edit(material: Material, data: types.SceneData, row: int, hint: str) -> str | None:
-    """Return the first field in which a material differs from its row in the tables of a device, or ``hint``."""
-    try:
-        textures.check_material(material)
-    except (ValueError, TypeError, AttributeError):
-        return hint
-    images = textures.distinct_textures([material])
-    new, old = textures.material_table([material], images)[0], data.materials.numpy()[row]
-    for field in new.dtype.names or ():
-        if field not in textures.TEXTURE_SLOTS:
-            if not np.array_equal(new[field], old[field]):
-                return field
-        elif (new[field] < 0) != (old[field] < 0):
-            return field
-        elif new[field] >= 0:
-            entry, image = data.textures.numpy()[old[field]], images[new[field]]
-            table, texels = textures.texture_table([image])
-            first, *others = table.dtype.names or ()
-            start = int(entry[first])
-            is_same = all(np.array_equal(entry[name], table[0][name]) for name in others)
-            if not is_same or not np.array_equal(data.texels.numpy()[start : start + len(texels)], texels):
-                return f"{field} {image.name!r}"
-    return None
-
-
-def _alike(a: Material, b: Material) -> bool:
-    """Return whether two materials look the same."""
-    if a is b or not (isinstance(a, Material) and isinstance(b, Material)):
-        return a is b
-    images = [textures.distinct_textures([material]) for material in (a, b)]
-    tables = [textures.material_table([material], own) for material, own in zip((a, b), images, strict=True)]
-    return tables[0].tobytes() == tables[1].tobytes() and all(
-        x is y or ((x.srgb, x.wrap) == (y.srgb, y.wrap) and np.array_equal(x.pixels, y.pixels))
-        for x, y in zip(*images, strict=True)
-    )
 
 
 def _are_lights_read_anew(scene: SceneContents) -> bool:

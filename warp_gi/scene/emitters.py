@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +10,9 @@ import numpy as np
 from warp_gi.color import LUMINANCE
 from warp_gi.errors import SceneError
 from warp_gi.kernels import types
-from warp_gi.scene.geometry import FlatGeometry
+from warp_gi.scene.geometry import FlatGeometry, placed_points, triangle_areas
 from warp_gi.scene.model import Material, Node, PunctualLight
+from warp_gi.scene.poses import poses
 from warp_gi.scene.textures import box_means, linear_rgb, texture_coordinates
 
 LIGHT_KINDS = {
@@ -72,13 +73,16 @@ def emissive_triangles(flat: FlatGeometry, materials: Sequence[Material]) -> tup
 
     Power is pi times area times the luminance of the mean emission under the
     triangle, twice that if both sides emit. A triangle is left out if its area is
-    zero or its texture is black all over it.
+    zero or its texture is black all over it. The area of one that changes its shape is the mean over time.
     """
     shining = np.array([max(m.emission) > 0.0 for m in materials])
     triangles = np.flatnonzero(shining[flat.materials])
-    corners = flat.points[flat.indices[triangles]]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    powers = np.pi * 0.5 * np.linalg.norm(cross.astype(np.float64), axis=1)
+    if flat.mean_areas is None:
+        corners = flat.points[flat.indices[triangles]]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        powers = np.pi * 0.5 * np.linalg.norm(cross.astype(np.float64), axis=1)
+    else:
+        powers = np.pi * flat.mean_areas[triangles]
     powers[powers < np.pi * SMALLEST_AREA] = 0.0
     for index in np.flatnonzero(shining).tolist():
         mine = flat.materials[triangles] == index
@@ -95,6 +99,32 @@ def emissive_triangles(flat: FlatGeometry, materials: Sequence[Material]) -> tup
         powers[mine] *= radiance @ LUMINANCE * (2.0 if material.double_sided else 1.0)
     kept = powers > 0.0
     return triangles[kept], powers[kept]
+
+
+def mean_areas(
+    nodes: Sequence[Node], flat: FlatGeometry, changing: Iterable[int], times: np.ndarray
+) -> np.ndarray | None:
+    """Return the area of each triangle, of lamps that change their shape as a mean over ``times`` [s].
+
+    ``changing`` are the nodes that do. None if none of them emits: float64 [triangle] otherwise.
+    """
+    lamps = [i for i in changing if any(max(mesh.material.emission) > 0.0 for mesh in nodes[i].meshes)]
+    if not lamps:
+        return None
+    areas, points = triangle_areas(flat.points, flat.indices), flat.points.copy()
+    vertices = flat.indices[:, 0]
+    mine = np.zeros(len(vertices), bool)
+    for index in lamps:
+        start, stop = flat.vertex_starts[index : index + 2]
+        mine |= (vertices >= start) & (vertices < stop)
+    areas[mine] = 0.0
+    for time in times.tolist():
+        placed = poses(nodes, time)
+        for index in lamps:
+            start, stop = flat.vertex_starts[index : index + 2]
+            points[start:stop] = placed_points(nodes[index], placed[index])
+        areas[mine] += triangle_areas(points, flat.indices[mine]) / len(times)
+    return areas
 
 
 def light_power(light: PunctualLight, radius: float) -> float:

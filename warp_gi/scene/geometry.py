@@ -10,6 +10,7 @@ import numpy as np
 from warp_gi.errors import SceneError
 from warp_gi.scene.animation import check_keyframes
 from warp_gi.scene.model import Material, Mesh, Node
+from warp_gi.scene.poses import Pose, check_deformation
 from warp_gi.scene.textures import check_material
 
 LARGEST_UV = 1e9
@@ -38,6 +39,9 @@ class FlatGeometry:
     """Second set of texture coordinates, v up, float32 [vertex, 2]; None if no mesh has one."""
     vertex_starts: list[int]
     """First vertex of each node, and the number of vertices at the end."""
+    mean_areas: np.ndarray | None = None
+    """Area of each triangle as a mean over time, square metres, float64 [triangle]; None where no lamp changes its
+    shape, and those of the points count."""
 
 
 def check_nodes(nodes: Sequence[Node]) -> None:
@@ -55,6 +59,7 @@ def check_nodes(nodes: Sequence[Node]) -> None:
             if id(mesh) not in checked:
                 check_mesh(mesh, f"mesh {mesh.name!r} of node {node.name!r}")
                 checked.add(id(mesh))
+        check_deformation(node, nodes)
     if not any(len(mesh.indices) for node in nodes for mesh in node.meshes):
         raise SceneError("the scene has no triangles; give at least one mesh with faces")
 
@@ -100,34 +105,18 @@ def distinct_materials(nodes: Sequence[Node]) -> list[Material]:
 
 def surface_area(points: np.ndarray, indices: np.ndarray) -> float:
     """Return the area of triangles ``indices`` [n, 3] of ``points`` [m, 3], one side of each."""
+    return float(triangle_areas(points, indices).sum())
+
+
+def triangle_areas(points: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Return the area of each of the triangles ``indices`` [n, 3] of ``points`` [m, 3], float64 [n]."""
     corners = points[indices].astype(np.float64)
     sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return float((0.5 * np.linalg.norm(sides, axis=1)).sum())
+    return 0.5 * np.linalg.norm(sides, axis=1)
 
 
-def transform_points(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return ``points`` [n, 3] moved by ``matrix`` [4, 4], float32."""
-    if np.array_equal(matrix, np.eye(4)):
-        return np.asarray(points, np.float32)
-    with np.errstate(over="ignore"):  # infinite points are an error of the Scene
-        return (np.asarray(points, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
-
-
-def transform_normals(matrix: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return unit normals [n, 3] moved by ``matrix``, float32; those without a direction become zero."""
-    linear = matrix[:3, :3]
-    cofactors = np.stack(
-        [np.cross(linear[1], linear[2]), np.cross(linear[2], linear[0]), np.cross(linear[0], linear[1])]
-    )
-    if np.linalg.det(linear) < 0.0:
-        cofactors = -cofactors
-    moved = np.nan_to_num(np.asarray(normals, np.float64), nan=0.0, posinf=0.0, neginf=0.0) @ cofactors.T
-    length = np.linalg.norm(moved, axis=1, keepdims=True)
-    return np.divide(moved, length, out=np.zeros_like(moved), where=length > 1e-12).astype(np.float32)
-
-
-def flatten(nodes: Sequence[Node], materials: Sequence[Material], world: Sequence[np.ndarray]) -> FlatGeometry:
-    """Return the triangles of all nodes, placed by ``world`` (world_from_node of each).
+def flatten(nodes: Sequence[Node], materials: Sequence[Material], poses: Sequence[Pose]) -> FlatGeometry:
+    """Return the triangles of all nodes in their poses.
 
     A mirroring transform turns its triangles' winding, so that fronts stay fronts.
     """
@@ -148,9 +137,8 @@ def flatten(nodes: Sequence[Node], materials: Sequence[Material], world: Sequenc
     )
     index_of = {id(material): index for index, material in enumerate(materials)}
     vertex = triangle = object_index = 0
-    for node, matrix in zip(nodes, world, strict=True):
+    for node, pose in zip(nodes, poses, strict=True):
         flat.vertex_starts.append(vertex)
-        mirrored = np.linalg.det(matrix[:3, :3]) < 0.0
         for mesh in node.meshes:
             vertices = slice(vertex, vertex + len(mesh.points))
             triangles = slice(triangle, triangle + len(mesh.indices))
@@ -160,7 +148,7 @@ def flatten(nodes: Sequence[Node], materials: Sequence[Material], world: Sequenc
                 flat.further_uvs[vertices] = _finite_uvs(mesh.further_uvs)
             if mesh.colors is not None and flat.colors is not None:
                 flat.colors[vertices, : np.shape(mesh.colors)[1]] = mesh.colors
-            flat.indices[triangles] = np.asarray(mesh.indices)[:, ::-1] if mirrored else mesh.indices
+            flat.indices[triangles] = np.asarray(mesh.indices)[:, ::-1] if pose.mirrors(mesh) else mesh.indices
             flat.indices[triangles] += vertex
             if id(mesh.material) not in index_of:
                 raise SceneError(
@@ -169,7 +157,7 @@ def flatten(nodes: Sequence[Node], materials: Sequence[Material], world: Sequenc
             flat.materials[triangles] = index_of[id(mesh.material)]
             flat.objects[triangles] = object_index
             vertex, triangle = vertices.stop, triangles.stop
-        place(flat, node, matrix, flat.vertex_starts[-1])
+        place(flat, node, pose, flat.vertex_starts[-1])
         object_index += bool(node.meshes)
     flat.vertex_starts.append(vertex)
     return flat
@@ -187,14 +175,20 @@ def _finite_uvs(uvs: np.ndarray) -> np.ndarray:
     return np.clip(np.nan_to_num(uvs, nan=0.0, posinf=0.0, neginf=0.0), -LARGEST_UV, LARGEST_UV)
 
 
-def place(flat: FlatGeometry, node: Node, matrix: np.ndarray, vertex: int) -> None:
-    """Write points and normals of ``node``'s meshes from ``vertex`` on, placed by ``matrix`` (world_from_node)."""
+def place(flat: FlatGeometry, node: Node, pose: Pose, vertex: int) -> None:
+    """Write points and normals of ``node``'s meshes in a pose from ``vertex`` on."""
     for mesh in node.meshes:
         end = vertex + len(mesh.points)
-        flat.points[vertex:end] = transform_points(matrix, mesh.points)
-        if mesh.normals is not None:
-            flat.normals[vertex:end] = transform_normals(matrix, mesh.normals)
+        points, normals = pose.vertices(mesh)
+        flat.points[vertex:end] = points
+        if normals is not None:
+            flat.normals[vertex:end] = normals
         vertex = end
+
+
+def placed_points(node: Node, pose: Pose) -> np.ndarray:
+    """Return the points of ``node``'s meshes in a pose, one mesh after another, float32 [vertex, 3]."""
+    return np.concatenate([pose.vertices(mesh)[0] for mesh in node.meshes])
 
 
 def triangulated(faces: np.ndarray) -> np.ndarray:

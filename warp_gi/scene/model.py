@@ -95,6 +95,22 @@ class Mesh:
     colors: np.ndarray | None = None
     """Linear colours from 0 to 1, float32 [vertex, 3], or [vertex, 4] with coverage; they multiply base colour and
     alpha of the material. None is all 1."""
+    targets: list[MorphTarget] = field(default_factory=list)
+    """Shapes that the ``morphs`` of a node blend in."""
+    joints: np.ndarray | None = None
+    """Joints that each vertex follows where a node has a ``skin``: indices in ``Skin.joints``, [vertex, influence]."""
+    joint_weights: np.ndarray | None = None
+    """How much it follows each of them, from 0 up, float32 [vertex, influence]; they count relative to their sum."""
+
+
+@dataclass(eq=False)
+class MorphTarget:
+    """A shape of a mesh, as what its vertices differ by."""
+
+    points: np.ndarray | None = None
+    """What is added to the positions at a weight of 1, in metres, float32 [vertex, 3]; None is nothing."""
+    normals: np.ndarray | None = None
+    """What is added to the normals, float32 [vertex, 3]; None is nothing."""
 
 
 @dataclass(eq=False)
@@ -138,6 +154,32 @@ class Node:
     pivot: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Point of the node's own space in a file that is its origin now, because what lies there is far away in the
     file; keyframes are given for the file's."""
+    skin: Skin | None = None
+    """Nodes that the vertices of the meshes follow; the placement of this node is then of no account for them."""
+    morphs: list[MorphKeyframe] | None = None
+    """Weights of the meshes' morph targets over time; None is none of them."""
+
+
+@dataclass(eq=False)
+class Skin:
+    """Joints that bend meshes: a vertex is where its joints would take it, weighted (linear blend skinning)."""
+
+    joints: list[int]
+    """Indices of the joints in Scene.nodes."""
+    joint_from_mesh: np.ndarray
+    """From the mesh as it is to the space of each joint, inverse bind matrices, float64 [joint, 4, 4]."""
+    name: str = "skin"
+    """Name in error messages."""
+
+
+@dataclass(frozen=True)
+class MorphKeyframe:
+    """Weights of morph targets at a time; linear between keys, held outside them."""
+
+    time: float
+    """Time of the weights in seconds."""
+    weights: tuple[float, ...]
+    """A weight for each target of the meshes; 0 leaves it out, 1 is all of it."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from warp_gi.errors import OptionError
-from warp_gi.scene.model import Mesh
+from warp_gi.scene.model import Mesh, MorphTarget
 
 NORMAL_STEPS = 511
 """Steps per unit to which components of normals are rounded, to tell which corners of a vertex can share one."""
@@ -34,8 +34,10 @@ def smooth_mesh(mesh: Mesh, angle: float) -> Mesh:
 
     # one vertex for all corners that had one (without uvs and colours: one position) and agree on the normal
     steps = np.round((normals + 1.0) * NORMAL_STEPS).astype(np.int64)
-    parts: dict[str, Any] = {"uvs": mesh.uvs, "further_uvs": mesh.further_uvs, "colors": mesh.colors}
-    vertex = position if all(part is None for part in parts.values()) else indices.reshape(-1)
+    labels = ("uvs", "further_uvs", "colors", "joints", "joint_weights")
+    parts: dict[str, Any] = {label: getattr(mesh, label) for label in labels}
+    is_bare = all(part is None for part in parts.values()) and not mesh.targets
+    vertex = position if is_bare else indices.reshape(-1)
     key = ((vertex * 1024 + steps[:, 0]) * 1024 + steps[:, 1]) * 1024 + steps[:, 2]
     _, first, corner_vertex = np.unique(key, return_index=True, return_inverse=True)
     source = indices.reshape(-1)[first]
@@ -45,6 +47,7 @@ def smooth_mesh(mesh: Mesh, angle: float) -> Mesh:
         points=np.asarray(mesh.points)[source],
         normals=normals[first].astype(np.float32),
         indices=corner_vertex.reshape(-1, 3).astype(np.int32),
+        targets=[MorphTarget(None if t.points is None else np.asarray(t.points)[source]) for t in mesh.targets],
         **split,
     )
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +14,7 @@ from warp_gi.errors import SceneError, unknown_name
 from warp_gi.forks import Guard
 from warp_gi.kernels import types
 from warp_gi.launch import get_device
-from warp_gi.scene import animation, copying, emitters, geometry, textures
+from warp_gi.scene import animation, copying, emitters, geometry, hashing, hulls, poses, textures
 from warp_gi.scene.device_scene import DeviceScene
 from warp_gi.scene.edits import Edits
 from warp_gi.scene.model import Keyframe, Material, Node, PunctualLight
@@ -28,6 +27,9 @@ if TYPE_CHECKING:
 
 POSES_FOR_BOUNDS = 33
 """Number of evenly spaced poses, beside those of the keyframes, that the bounds of an animated scene enclose."""
+
+POSES_FOR_AREAS = 9
+"""Number of evenly spaced poses over which areas of lamps that change their shape are averaged."""
 
 
 class Scene:
@@ -90,11 +92,14 @@ class Scene:
     def _flatten(self) -> None:
         """Build what follows from the nodes; call again when keyframes change."""
         self.version += 1
-        self._moving = animation.moving_nodes(self.nodes)
-        self._world = [matrix.copy() for matrix in animation.world_matrices(self.nodes, 0.0)]
-        self._flat = geometry.flatten(self.nodes, self.materials, self._world)
+        self._moving = poses.moving_nodes(self.nodes)
+        self._poses = poses.poses(self.nodes, 0.0)
+        self._flat = geometry.flatten(self.nodes, self.materials, self._poses)
+        self._hulls = hulls.hulls_of(self.nodes, self._moving)
         if not np.isfinite(self._flat.points).all():
             raise SceneError(f"scene {self.name!r}: node transforms move vertices past the range of float32")
+        times = np.linspace(0.0, self.duration, POSES_FOR_AREAS)
+        self._flat.mean_areas = emitters.mean_areas(self.nodes, self._flat, self._hulls, times)
         self._emissive, self._triangle_powers = emitters.emissive_triangles(self._flat, self.materials)
         self._bounds = self._all_bounds()
         self._devices: dict[str, DeviceScene] = {}
@@ -197,7 +202,7 @@ class Scene:
 
     @property
     def is_animated(self) -> bool:
-        """Whether any node has keyframes."""
+        """Whether any node has keyframes, or meshes that change their shape."""
         return any(self._moving)
 
     @property
@@ -228,34 +233,13 @@ class Scene:
     def geometry_hash(self) -> str:
         """SHA-256 of all that decides visibility: triangles, alpha masks, animation."""
         if self._geometry_hash is None:
-            digest = hashlib.sha256(b"warp_gi geometry 1")
-            flat = self._flat
-            masked = np.array([m.alpha_cutoff is not None for m in self.materials])
-            _update(digest, flat.points, flat.indices)
-            if masked.any():
-                triangles = masked[flat.materials]
-                _update(digest, triangles, flat.materials[triangles], flat.uvs[flat.indices[triangles]])
-                if flat.colors is not None:
-                    _update(digest, flat.colors[flat.indices[triangles], 3])
-                for material in (m for m in self.materials if m.alpha_cutoff is not None):
-                    texture = material.base_color_texture
-                    _update(digest, np.array([material.alpha, material.alpha_cutoff]))
-                    if texture is not None:
-                        _update(digest, repr((texture.wrap, texture.nearest)), texture.pixels[..., 3])
-            for index, node in enumerate(self.nodes):
-                if self._moving[index]:
-                    keys = [asdict(key) for key in node.keyframes or ()]
-                    start, stop = self._flat.vertex_starts[index : index + 2]
-                    _update(digest, repr((start, stop, node.parent, keys)), np.asarray(node.parent_from_node))
-            self._geometry_hash = digest.hexdigest()
+            self._geometry_hash = hashing.geometry_hash(self)
         return self._geometry_hash
 
     @property
     def hash(self) -> str:
         """SHA-256 of all that decides the pictures, except the cameras; equal in every process."""
-        digest = hashlib.sha256(self.contents_hash.encode())
-        _update(digest, "no sky" if self._environment is None else self._environment.content_hash)
-        return digest.hexdigest()
+        return hashing.with_sky(self.contents_hash, self._environment)
 
     @property
     def contents_hash(self) -> str:
@@ -264,19 +248,7 @@ class Scene:
         It is computed once: a sky that changes from frame to frame must not cost a pass over all textures.
         """
         if self._contents_hash is None:
-            digest = hashlib.sha256(b"warp_gi scene 1" + self.geometry_hash.encode())
-            flat = self._flat
-            _update(digest, flat.normals, flat.uvs, flat.materials, flat.objects)
-            _update(digest, *(part for part in (flat.colors, flat.further_uvs) if part is not None))
-            images = textures.distinct_textures(self.materials)
-            _update(digest, textures.material_table(self.materials, images))
-            for image in images:
-                how = image.srgb, image.wrap, image.nearest, image.uv_set, image.transform
-                _update(digest, repr(how), image.pixels)
-            world = animation.world_matrices(self.nodes, 0.0)
-            _update(digest, emitters.emitter_table(self._emissive, self.lights, world))
-            _update(digest, repr([light.node for light in self.lights]))
-            self._contents_hash = digest.hexdigest()
+            self._contents_hash = hashing.contents_hash(self, self.geometry_hash)
         return self._contents_hash
 
     # ---- what moves ----
@@ -298,7 +270,7 @@ class Scene:
             self._flatten()
 
     def moves(self, index: int) -> bool:
-        """Return whether node ``index``, or one above it, has keyframes."""
+        """Return whether node ``index``, or one above it, has keyframes, or its meshes change their shape."""
         return self._moving[index]
 
     @property
@@ -309,9 +281,16 @@ class Scene:
 
     def node_box(self, index: int, time: float) -> np.ndarray:
         """Return a box around the meshes of node ``index`` at ``time`` [s]: low and high corner, float64 [2, 3]."""
-        matrix, corners = self.world_from_node(index, time), animation.box_corners(self.nodes[index])
-        points = corners @ matrix[:3, :3].T + matrix[:3, 3]
+        pose = poses.poses(self.nodes, time)[index]
+        if index in self._hulls:
+            return hulls.pose_box(pose, self._hulls[index])
+        points = animation.box_corners(self.nodes[index]) @ pose.matrix[:3, :3].T + pose.matrix[:3, 3]
         return np.stack([points.min(axis=0), points.max(axis=0)])
+
+    def shape_key(self, indices: Iterable[int], time: float) -> np.ndarray:
+        """Return what decides where the vertices of nodes are at ``time`` [s], and their placements, float64 [n]."""
+        placed = poses.poses(self.nodes, time)
+        return np.concatenate([np.zeros(0), *(placed[index].key for index in indices)])
 
     def world_from_node(self, index: int, time: float) -> np.ndarray:
         """Return the placement of node ``index`` at ``time`` [s], float64 [4, 4]."""
@@ -382,20 +361,13 @@ class Scene:
         boxes = [np.stack([flat.points[used].min(axis=0), flat.points[used].max(axis=0)])]
         if self.is_animated:
             evenly = np.linspace(0.0, self.duration, POSES_FOR_BOUNDS)
-            swept = animation.swept_box(self.nodes, self._moving, evenly)
-            boxes += [swept] if np.isfinite(swept).all() else []
+            for swept in (
+                animation.swept_box(self.nodes, self._moving, evenly),
+                hulls.swept_box(self.nodes, self._hulls, evenly),
+            ):
+                boxes += [swept] if np.isfinite(swept).all() else []
         return np.stack([np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))]).astype(np.float32)
 
 
 def _device(device: str | wp.Device | None) -> wp.Device:
     return device if isinstance(device, wp.Device) else get_device(device)
-
-
-def _update(digest: hashlib._Hash, *parts: np.ndarray | str) -> None:
-    """Add arrays (with their dtype and shape) and texts to a digest."""
-    for part in parts:
-        if isinstance(part, str):
-            digest.update(part.encode())
-        else:
-            digest.update(repr((part.dtype.str if part.dtype.names is None else "", part.shape)).encode())
-            digest.update(np.ascontiguousarray(part).view(np.uint8).reshape(-1).data)

@@ -1,4 +1,4 @@
-"""glTF 2.0 and GLB files: hierarchy, meshes, materials, cameras, punctual lights and node animation.
+"""glTF 2.0 and GLB files: hierarchy, meshes, skins, materials, cameras, punctual lights and animation.
 
 What becomes of each feature of the format is in the table of ``support.py``. What a file uses and is not read in
 full is noted there; unknown extensions that a file requires are an error.
@@ -14,11 +14,12 @@ import numpy as np
 
 from warp_gi.errors import OptionError, SceneError
 from warp_gi.scene.animation import moving_nodes, pose_matrix, world_matrices
-from warp_gi.scene.files.gltf_animation import read_keyframes
+from warp_gi.scene.files.gltf_animation import read_animations
 from warp_gi.scene.files.gltf_buffers import Buffers, split_glb
 from warp_gi.scene.files.gltf_compressed import BASISU, INSTALL, decoder
 from warp_gi.scene.files.gltf_document import Document, Part
 from warp_gi.scene.files.gltf_meshes import MeshReader
+from warp_gi.scene.files.gltf_skins import Bones, SkinReader
 from warp_gi.scene.files.parts import SceneParts
 from warp_gi.scene.files.support import BY_NAME
 from warp_gi.scene.model import Node, PunctualLight
@@ -65,47 +66,66 @@ def _check_extensions(document: Document) -> None:
 class _Reader:
     def __init__(self, document: Document, buffers: Buffers) -> None:
         self.document, self.buffers, self.path = document, buffers, document.path
-        self.meshes = MeshReader(document, buffers)
+        self.meshes, self.skins = MeshReader(document, buffers), SkinReader(document, buffers)
+        self.animations = read_animations(document, buffers)
 
     def parts(self) -> SceneParts:
         """Return nodes in depth-first order, with what hangs on them."""
-        keyframes = read_keyframes(self.document, self.buffers)
         nodes: list[Node] = []
         sources: list[tuple[Part, str]] = []
         names = _Names()
         pending: list[tuple[int, int | None, str]] = [(index, None, "the scene") for index in reversed(self._roots())]
-        seen: set[int] = set()
+        numbers: dict[int, int] = {}
+        bent: list[tuple[Node, Bones, str]] = []
         while pending:
             index, parent, owner = pending.pop()
             source = self.document.item("nodes", index, owner)
-            if index in seen:
+            if index in numbers:
                 raise SceneError(f"{str(self.path)!r}: node {index} hangs on two parents or on itself")
-            seen.add(index)
+            numbers[index] = len(nodes)
             owner = self.document.name("nodes", index)
             children = self.document.indices(source, "children", owner)
             pending.extend((child, len(nodes), owner) for child in reversed(children))
             sources.append((source, owner))
-            nodes.append(self._node(source, owner, names, parent))
-            nodes[-1].keyframes = keyframes.get(index)
+            bones = self._bones(source, owner)
+            nodes.append(self._node(source, owner, names, parent, bones, index))
+            if bones is not None:
+                bent.append((nodes[-1], bones, owner))
             copies = self._instances(source, owner, nodes[-1], names, len(nodes) - 1)
             nodes += copies
             sources += [({}, owner)] * len(copies)
+        for node, bones, owner in bent:
+            node.skin = bones.placed(self.document, numbers, owner)
         return self._with_lights_and_cameras(nodes, sources)
 
-    def _node(self, source: Part, owner: str, names: _Names, parent: int | None) -> Node:
+    def _bones(self, source: Part, owner: str) -> Bones | None:
+        """Return the skin of a node's meshes, or None."""
+        if source.get("skin") is None or source.get("mesh") is None:
+            return None
+        return self.skins.bones(self.document.whole(source, "skin", owner), owner)
+
+    def _node(
+        self, source: Part, owner: str, names: _Names, parent: int | None, bones: Bones | None, index: int
+    ) -> Node:
         document = self.document
-        weights = document.weights(source, owner)
-        if source.get("skin") is not None:
-            document.findings.add("skins", owner)
-        meshes = []
+        weights, morphs = document.weights(source, owner), self.animations.morphs.get(index)
+        if morphs is not None and len(morphs) == 1:
+            weights, morphs = morphs[0].weights, None
+        node = Node(names.unique(document.text(source, "name") or owner), [], self._matrix(source, owner), parent)
+        node.keyframes = self.animations.keyframes.get(index)
         if source.get("mesh") is not None:
-            meshes = list(self.meshes.meshes(document.whole(source, "mesh", owner), owner, weights))
-        return Node(names.unique(document.text(source, "name") or owner), meshes, self._matrix(source, owner), parent)
+            number = document.whole(source, "mesh", owner)
+            node.meshes = list(self.meshes.meshes(number, owner, weights, bones, morphs is not None))
+            node.morphs = morphs
+        return node
 
     def _instances(self, source: Part, owner: str, node: Node, names: _Names, index: int) -> list[Node]:
         """Return the copies of a node's meshes that EXT_mesh_gpu_instancing asks for, and take them from the node."""
         extension = self.document.extension(source, "EXT_mesh_gpu_instancing", owner)
         if extension is None or not node.meshes:
+            return []
+        if source.get("skin") is not None:
+            self.document.findings.add("instances of meshes with a skin", owner)
             return []
         given = self.document.part(extension, "attributes", owner) or {}
         widths = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}
@@ -126,8 +146,11 @@ class _Reader:
         count = counts.pop() if counts else 0
         rest = {"TRANSLATION": (0.0,) * 3, "ROTATION": (0.0, 0.0, 0.0, 1.0), "SCALE": (1.0,) * 3}
         matrices = pose_matrix(*(values.get(name, np.tile(one, (count, 1))) for name, one in rest.items()))
-        meshes, node.meshes = node.meshes, []
-        return [Node(names.unique(f"{node.name} {i + 1}"), list(meshes), one, index) for i, one in enumerate(matrices)]
+        meshes, morphs, node.meshes, node.morphs = node.meshes, node.morphs, [], None
+        return [
+            Node(names.unique(f"{node.name} {i + 1}"), list(meshes), one, index, morphs=morphs)
+            for i, one in enumerate(matrices)
+        ]
 
     def _matrix(self, source: Part, owner: str) -> np.ndarray:
         if source.get("matrix") is not None:

@@ -1,16 +1,19 @@
-"""Node animation of glTF as keyframes."""
+"""Animation of glTF as keyframes: poses of nodes, and weights of morph targets."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from warp_gi.scene.animation import slerp
 from warp_gi.scene.files.gltf_buffers import Buffers
 from warp_gi.scene.files.gltf_document import Document, Part
-from warp_gi.scene.model import Keyframe
+from warp_gi.scene.model import Keyframe, MorphKeyframe
 
 CUBIC_STEPS = 16  # linear pieces that a cubic spline becomes between two of its keys
 WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}
+WEIGHTS = "weights"
 STEP_SECONDS = 1e-5  # how long before its next key a STEP value is last held
 
 
@@ -18,8 +21,9 @@ class _Channel:
     """One animated property: times [key] and values [key, width], to be read at any time."""
 
     def __init__(self, times: np.ndarray, values: np.ndarray, interpolation: str, is_rotation: bool) -> None:
+        """Take values [key, width], or [3 * key, width] of a cubic spline."""
         self.times, self.is_rotation, self.interpolation = times.astype(np.float64), is_rotation, interpolation
-        values = values.astype(np.float64).reshape(len(times), -1, 4 if is_rotation else 3)
+        values = values.astype(np.float64).reshape(len(times), -1, values.shape[1])
         self.values = values[:, 1] if interpolation == "CUBICSPLINE" else values[:, 0]
         self.tangents = values if interpolation == "CUBICSPLINE" else None
 
@@ -52,8 +56,18 @@ class _Channel:
         return slerp(a, b, t) if self.is_rotation else (1.0 - t) * a + t * b
 
 
-def read_keyframes(document: Document, buffers: Buffers) -> dict[int, list[Keyframe]]:
-    """Return the keyframes of each animated node; where several animations move one property, the first counts."""
+@dataclass
+class Animations:
+    """All that moves in a file, by the number of its node."""
+
+    keyframes: dict[int, list[Keyframe]]
+    """Poses of nodes."""
+    morphs: dict[int, list[MorphKeyframe]]
+    """Weights of morph targets."""
+
+
+def read_animations(document: Document, buffers: Buffers) -> Animations:
+    """Return what moves; where several animations move one property, the first counts."""
     channels: dict[int, dict[str, _Channel]] = {}
     animations = document.items("animations")
     if len(animations) > 1:
@@ -64,9 +78,7 @@ def read_keyframes(document: Document, buffers: Buffers) -> dict[int, list[Keyfr
         for channel in document.objects(animation, "channels", name):
             target = document.part(channel, "target", name) or {}
             path = target.get("path")
-            if target.get("node") is None or not isinstance(path, str) or path not in WIDTHS:
-                if path == "weights":
-                    document.findings.add("animation of morph weights", name)
+            if target.get("node") is None or not isinstance(path, str) or path not in (*WIDTHS, WEIGHTS):
                 continue
             node = document.whole(target, "node", name)
             document.item("nodes", node, name)
@@ -75,25 +87,53 @@ def read_keyframes(document: Document, buffers: Buffers) -> dict[int, list[Keyfr
             number = document.whole(channel, "sampler", name)
             if number >= len(samplers):
                 raise document.error(name, f"names sampler {number}, and it has {len(samplers)}")
-            found = _channel(document, buffers, samplers[number], path, name)
+            values = 1
+            if path == WEIGHTS:
+                values = _target_count(document, node, name)
+            found = _channel(document, buffers, samplers[number], path, name, values)
             if found is not None:
                 channels[node][path] = found
-    return {node: _merge(document, node, paths) for node, paths in channels.items() if paths}
+    morphs = {node: _morphs(paths.pop(WEIGHTS)) for node, paths in channels.items() if WEIGHTS in paths}
+    return Animations({node: _merge(document, node, paths) for node, paths in channels.items() if paths}, morphs)
 
 
-def _channel(document: Document, buffers: Buffers, sampler: Part, path: str, name: str) -> _Channel | None:
-    """Return one animated property; None if it has no keys."""
+def _target_count(document: Document, node: int, name: str) -> int:
+    """Return the number of morph targets of a node's mesh; raises SceneError if it has none."""
+    source, owner = document.items("nodes")[node], document.name("nodes", node)
+    count = 0
+    if source.get("mesh") is not None:
+        mesh = document.item("meshes", document.whole(source, "mesh", owner), owner)
+        primitives = document.objects(mesh, "primitives", owner)
+        count = max((len(document.objects(one, "targets", owner)) for one in primitives), default=0)
+    if not count:
+        raise document.error(name, f"moves weights of {owner}, whose mesh has no morph targets")
+    return count
+
+
+def _channel(
+    document: Document, buffers: Buffers, sampler: Part, path: str, name: str, each: int = 1
+) -> _Channel | None:
+    """Return one animated property with ``each`` values a key; None if it has no keys."""
     times = buffers.accessor(sampler.get("input"), name, (1,))
-    values = buffers.accessor(sampler.get("output"), name, (WIDTHS[path],))
+    values = buffers.accessor(sampler.get("output"), name, (WIDTHS.get(path, 1),))
     kind = sampler.get("interpolation") or "LINEAR"
     if kind not in ("LINEAR", "STEP", "CUBICSPLINE"):
         raise document.error(name, f"interpolation must be LINEAR, STEP or CUBICSPLINE, got {kind!r:.60}")
-    needed = len(times) * (3 if kind == "CUBICSPLINE" else 1)
+    needed = len(times) * (3 if kind == "CUBICSPLINE" else 1) * each
     if len(values) != needed:
         raise document.error(name, f"has {len(times)} times and {len(values)} values of {path}; expected {needed}")
     if len(times) and not (np.isfinite(times).all() and np.isfinite(values).all() and (np.diff(times) > 0.0).all()):
         raise document.error(name, f"the times of {path} must rise, and all numbers be finite")
-    return _Channel(times, values, kind, path == "rotation") if len(times) else None
+    return _Channel(times, values.reshape(-1, WIDTHS.get(path, each)), kind, path == "rotation") if len(times) else None
+
+
+def _morphs(channel: _Channel) -> list[MorphKeyframe]:
+    """Return the keyframes of weights; one if they never change."""
+    times = np.unique(np.asarray(channel.key_times()))
+    values = channel.values_at(times)
+    if (values == values[0]).all():
+        times, values = times[:1], values[:1]
+    return [MorphKeyframe(time, tuple(row)) for time, row in zip(times.tolist(), values.tolist(), strict=True)]
 
 
 def _merge(document: Document, index: int, channels: dict[str, _Channel]) -> list[Keyframe]:

@@ -11,36 +11,46 @@ from warp_gi.scene.files.gltf_buffers import Buffers
 from warp_gi.scene.files.gltf_compressed import DRACO, draco_attributes
 from warp_gi.scene.files.gltf_document import Document, Part
 from warp_gi.scene.files.gltf_materials import Coordinates, MaterialReader
-from warp_gi.scene.model import Mesh
+from warp_gi.scene.files.gltf_skins import Bones, vertex_joints
+from warp_gi.scene.model import Mesh, MorphTarget
+from warp_gi.scene.poses import morphed
 
 TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN = 4, 5, 6
 FURTHER_SET = re.compile(r"(COLOR|TEXCOORD|JOINTS|WEIGHTS)_[1-9]\d*")
 
 
 class MeshReader:
-    """Makes the meshes of a document, each once for each set of morph weights."""
+    """Makes the meshes of a document, each once for each set of morph weights and each skin."""
 
     def __init__(self, document: Document, buffers: Buffers) -> None:
         self.document, self.buffers = document, buffers
         self.materials = MaterialReader(document, buffers)
-        self._meshes: dict[tuple[int, tuple[float, ...]], list[Mesh]] = {}
+        self._meshes: dict[tuple[int, tuple[float, ...] | None, int], list[Mesh]] = {}
 
-    def meshes(self, index: int, owner: str, weights: Sequence[float] | None) -> list[Mesh]:
-        """Return mesh ``index`` as one mesh a primitive; ``weights`` of morph targets replace the mesh's own."""
+    def meshes(
+        self, index: int, owner: str, weights: Sequence[float] | None, bones: Bones | None = None, morphs: bool = False
+    ) -> list[Mesh]:
+        """Return mesh ``index`` as one mesh a primitive; ``weights`` of morph targets replace the mesh's own.
+
+        With ``bones`` the vertices have their joints. ``morphs`` keeps the targets, for weights that change.
+        """
         source = self.document.item("meshes", index, owner)
         name = self.document.name("meshes", index)
         if weights is None:
             weights = self.document.weights(source, name) or ()
-        key = index, tuple(weights) if any(weights) else ()
+        blend = None if morphs else tuple(weights) if any(weights) else ()
+        key = index, blend, id(bones)
         if key not in self._meshes:
             primitives = self.document.objects(source, "primitives", name)
             label = self.document.text(source, "name") or name
-            found = (self._primitive(one, name, label, key[1]) for one in primitives)
+            found = (self._primitive(one, name, label, blend, bones) for one in primitives)
             self._meshes[key] = [mesh for mesh in found if mesh is not None]
         return self._meshes[key]
 
-    def _primitive(self, source: Part, owner: str, label: str, weights: Sequence[float]) -> Mesh | None:
-        """Return one primitive as a mesh, or None if it is not made of triangles."""
+    def _primitive(
+        self, source: Part, owner: str, label: str, weights: Sequence[float] | None, bones: Bones | None
+    ) -> Mesh | None:
+        """Return one primitive as a mesh, or None if it is not made of triangles; no weights keep its targets."""
         document = self.document
         mode = source.get("mode", TRIANGLES)
         if mode not in (TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN):
@@ -67,8 +77,15 @@ class MeshReader:
         if mode == TRIANGLES and len(corners) % 3:
             raise document.error(owner, f"has {len(corners)} indices, not a multiple of 3")
         normals = self._attribute(attributes, "NORMAL", owner, len(points), (3,))
-        if any(weights):
-            points, normals = self._morphed(source, owner, weights, points, normals)
+        targets = []
+        if weights is None or any(weights):
+            targets = self._targets(source, owner, len(points), weights)
+        if weights is not None:
+            points, normals = morphed(Mesh(points, corners, normals=normals, targets=targets), np.array(weights))
+            targets, points = [], points.astype(np.float32)
+        joints, joint_weights = None, None
+        if bones is not None:
+            joints, joint_weights = vertex_joints(document, self.buffers, attributes, owner, len(points), bones)
         index = None if source.get("material") is None else document.whole(source, "material", owner)
         material, coordinates = self.materials.material(index, owner)
         self._note(attributes, owner)
@@ -83,6 +100,9 @@ class MeshReader:
             if coordinates.further is None
             else self._uvs(attributes, Coordinates(coordinates.further, needed=True), owner, len(points)),
             colors=self._colors(attributes, owner, len(points)),
+            targets=targets,
+            joints=joints,
+            joint_weights=joint_weights,
         )
 
     def _decompressed(self, source: Part, attributes: Part, owner: str, mode: int) -> int:
@@ -129,25 +149,21 @@ class MeshReader:
         colors = np.clip(np.nan_to_num(np.asarray(colors, np.float32), nan=1.0), 0.0, 1.0)
         return None if (colors == 1.0).all() else np.ascontiguousarray(colors)
 
-    def _morphed(
-        self, source: Part, owner: str, weights: Sequence[float], points: np.ndarray, normals: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return positions and normals with the weighted morph targets added."""
+    def _targets(self, source: Part, owner: str, count: int, weights: Sequence[float] | None) -> list[MorphTarget]:
+        """Return the morph targets of a primitive; those with a weight of zero are empty."""
         targets = self.document.objects(source, "targets", owner)
-        if len(targets) != len(weights):
+        if weights is not None and len(targets) != len(weights):
             raise self.document.error(owner, f"has {len(targets)} morph targets and {len(weights)} weights")
-        moved = points.astype(np.float64)
-        turned = None if normals is None else normals.astype(np.float64)
-        for target, weight in zip(targets, weights, strict=True):
+        found = []
+        for target, weight in zip(targets, [1.0] * len(targets) if weights is None else weights, strict=True):
             if weight and any(name.startswith(("COLOR_", "TEXCOORD_")) for name in target):
                 self.document.findings.add("morph targets of colours and texture coordinates", owner)
-            shift = self._attribute(target, "POSITION", owner, len(points), (3,))
-            if shift is not None:
-                moved += weight * shift
-            bend = self._attribute(target, "NORMAL", owner, len(points), (3,))
-            if turned is not None and bend is not None:
-                turned += weight * bend
-        return moved.astype(np.float32), turned
+            parts = [
+                None if values is None or not weight else np.ascontiguousarray(values, np.float32)
+                for values in (self._attribute(target, name, owner, count, (3,)) for name in ("POSITION", "NORMAL"))
+            ]
+            found.append(MorphTarget(*parts))
+        return found
 
     def _note(self, attributes: Part, owner: str) -> None:
         """Note attributes that are not read."""

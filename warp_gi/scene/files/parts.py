@@ -7,11 +7,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from warp_gi.scene.animation import moved_keyframes, turned_quaternion, world_matrices
+from warp_gi.scene.animation import moved_keyframes, turned_quaternion
 from warp_gi.scene.files.support import Findings
 from warp_gi.scene.model import Mesh, Node, PunctualLight
 from warp_gi.scene.normals import smooth_mesh
 from warp_gi.scene.pinhole import Camera
+from warp_gi.scene.poses import deforms, poses
 
 
 @dataclass(eq=False)
@@ -50,16 +51,16 @@ class SceneParts:
         """
         boxes: dict[int, np.ndarray] = {}
         found, matrices, counts = [], [], []
-        for node, matrix in zip(self.nodes, world_matrices(self.nodes, 0.0), strict=True):
+        for node, pose in zip(self.nodes, poses(self.nodes, 0.0), strict=True):
             for mesh in node.meshes:
-                if id(mesh) not in boxes:
-                    used = mesh.indices[(mesh.indices >= 0) & (mesh.indices < len(mesh.points))]
-                    corners = np.asarray(mesh.points)[used]
-                    corners = corners[np.isfinite(corners).all(axis=1)]
-                    rows = [corners.min(axis=0), corners.max(axis=0)] if len(corners) else []
-                    boxes[id(mesh)] = np.array(rows, np.float64)
-                if len(boxes[id(mesh)]):
-                    found.append(boxes[id(mesh)])
+                if deforms(node):
+                    box, matrix = _box(mesh, pose.vertices(mesh)[0]), np.eye(4)
+                else:
+                    if id(mesh) not in boxes:
+                        boxes[id(mesh)] = _box(mesh, np.asarray(mesh.points))
+                    box, matrix = boxes[id(mesh)], pose.matrix
+                if len(box):
+                    found.append(box)
                     matrices.append(matrix)
                     counts.append(len(mesh.indices))
         ends, placed = np.array(found).reshape(-1, 2, 3), np.array(matrices).reshape(-1, 4, 4)
@@ -70,15 +71,15 @@ class SceneParts:
     def recentred(self, offset: np.ndarray) -> SceneParts:
         """Return the parts with ``offset`` taken from all positions, in double precision."""
         parents = {node.parent for node in self.nodes}
+        joints = {joint for node in self.nodes if node.skin is not None for joint in node.skin.joints}
         back = np.eye(4)
         back[:3, 3] = -offset
 
         def moved_node(index: int, node: Node) -> Node:
             if node.parent is not None:
                 return node
-            is_bare = (
-                node.keyframes is None and index not in parents and np.array_equal(node.parent_from_node, np.eye(4))
-            )
+            is_still = node.keyframes is None and np.array_equal(node.parent_from_node, np.eye(4))
+            is_bare = is_still and index not in parents and index not in joints and node.skin is None
             if is_bare:  # its points may be doubles: they are moved before the cast
                 x, y, z = (offset + node.pivot).tolist()
                 moved = [replace(mesh, points=mesh.points - offset) for mesh in node.meshes]
@@ -188,3 +189,11 @@ class SceneParts:
 
         nodes = [replace(node, meshes=[smoothed_mesh(mesh) for mesh in node.meshes]) for node in self.nodes]
         return replace(self, nodes=nodes)
+
+
+def _box(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    """Return low and high corner around the finite points of a mesh's triangles, float64 [2, 3]; [0] without any."""
+    used = mesh.indices[(mesh.indices >= 0) & (mesh.indices < len(points))]
+    corners = points[used]
+    corners = corners[np.isfinite(corners).all(axis=1)]
+    return np.array([corners.min(axis=0), corners.max(axis=0)] if len(corners) else [], np.float64)

@@ -314,5 +314,4 @@ def _key(scene: Scene | BakedScene, time: float) -> str:
     if isinstance(scene, BakedScene):
         return ""
     sky = "" if scene.environment is None else scene.environment.content_hash
-    poses = [scene.world_from_node(index, time).tobytes() for index in range(len(scene.nodes)) if scene.moves(index)]
-    return sky + b"".join(poses).hex()
+    return sky + scene.shape_key(filter(scene.moves, range(len(scene.nodes))), time).tobytes().hex()

@@ -197,12 +197,16 @@ def object_grids(scene: Scene, time: float, device: wp.Device) -> wp.array:
     """Return the grids of a scene's objects in their pose at ``time`` [s], ObjectGrid [object]; none if nothing moves.
 
     An object that is far larger or smaller than at time 0 takes the grid of all that is at rest: in its own one cells
-    would be as much larger or smaller.
+    would be as much larger or smaller. The cells of one that changes its shape are its own, and rest in the world: its
+    surface moves through them.
     """
     moving, objects = scene.moving_objects, len(scene.object_names)
     rows = np.zeros(objects if moving else 0, ObjectGrid.numpy_dtype())
     rest, now = (world_matrices(scene.nodes, at) if moving else [] for at in (0.0, time))
     for number, index in moving.items():
+        if scene.nodes[index].skin is not None:
+            rows[number]["number"], rows[number]["rest_from_world"] = 1 + number % int(MOST_OBJECTS), np.eye(4)
+            continue
         volume = abs(np.linalg.det(now[index][:3, :3]))
         grown = abs(np.linalg.det(rest[index][:3, :3])) / volume if volume > SMALLEST_VOLUME else 0.0
         if LEAST_SCALE**3 < grown < LEAST_SCALE**-3:

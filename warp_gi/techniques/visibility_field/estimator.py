@@ -291,7 +291,7 @@ class VisibilityField(Estimator):
         frame.launch_tiled(trace_kernels.trace_field, inputs)
 
     def _relight_key(self, frame: Frame, state: FieldState) -> tuple[object, ...]:
-        poses = b"".join(pose.tobytes() for pose in state.poses or ())
+        poses = b"" if state.poses is None else state.poses.tobytes()
         camera = frame.camera
         return camera.world_from_camera.tobytes(), camera.lens, poses, len(state.cells)
 

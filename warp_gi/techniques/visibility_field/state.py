@@ -95,8 +95,8 @@ class FieldState:
         """Surface samples of the static layer, their rays, and how many of those were traced."""
         self.movers = scene.moving_objects
         """Node of each object that can move, by the object's number."""
-        self.poses: list[np.ndarray] | None = None
-        """float64 [4, 4]: world matrix of each mover in the last frame; None before the first one."""
+        self.poses: np.ndarray | None = None
+        """What decides where vertices of movers were in the last frame, float64 [n]; None before the first one."""
         self.is_still = False
         """Whether nothing moved between the last two frames."""
         self.settled = SettledLayer.nothing(self.words)
@@ -181,7 +181,7 @@ class FieldState:
             "settled_flags": self.settled.flags,
             "settled_masks": self.settled.masks,
             "settled_empty_cells": self.settled.empty,
-            "poses": np.array(self.poses or np.zeros((0, 4, 4)), np.float64),
+            "poses": np.zeros(0) if self.poses is None else self.poses,
         }
 
     def with_saved_arrays(self, arrays: Mapping[str, np.ndarray]) -> FieldState:
@@ -200,7 +200,7 @@ class FieldState:
         state.empty[arrays["empty_cells"]] = True
         names = ("cells", "masks", "flags", "empty_cells")
         state.settled = SettledLayer(*(arrays[f"settled_{name}"] for name in names))
-        state.poses = list(arrays["poses"]) or None
+        state.poses = arrays["poses"] if len(arrays["poses"]) else None
         state.transfer, state.transfer_key = None, None
         return state
 
@@ -292,8 +292,8 @@ class FieldState:
 
     def move(self, now: float) -> None:
         """Take note of where everything is at ``now`` [s], and drop the settled layer if anything moved."""
-        poses = [self.scene.world_from_node(node, now) for node in self.movers.values()]
-        moved = self.poses is None or any(not np.array_equal(a, b) for a, b in zip(poses, self.poses, strict=True))
+        poses = self.scene.shape_key(self.movers.values(), now)
+        moved = self.poses is None or not np.array_equal(poses, self.poses)
         if moved and self.movers:
             self.settled = SettledLayer.nothing(self.words)
             self._is_stale = True
