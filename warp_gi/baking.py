@@ -165,9 +165,19 @@ def load_bake(path: str | Path) -> Bake:
         raise _damaged(path)
     try:
         technique, scene_key, scene_name = (str(record[name]) for name in _TEXTS)
-        return Bake(technique, scene_key, dict(record["settings"]), arrays, dict(record["counts"]), scene_name)
-    except (KeyError, TypeError, ValueError) as error:
+        settings, counts = dict(record["settings"]), dict(record["counts"])
+        if not (_are(settings, str | int | float) and _are(counts, int | float)):
+            raise _damaged(path)
+        return Bake(technique, scene_key, settings, arrays, counts, scene_name)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise _damaged(path) from error
+
+
+def _are(values: Mapping[str, Any], kinds: Any) -> bool:
+    """Return whether all values are of some kinds, and finite."""
+    return all(
+        isinstance(value, kinds) and (isinstance(value, str) or math.isfinite(value)) for value in values.values()
+    )
 
 
 def _record(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:

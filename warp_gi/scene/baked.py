@@ -12,6 +12,7 @@ from warp_gi.baking import Bake
 from warp_gi.errors import BakeError, OptionError
 from warp_gi.forks import Guard
 from warp_gi.kernels import types
+from warp_gi.layout import Layout, check_layout
 
 if TYPE_CHECKING:
     from warp_gi.scene.pinhole import Camera
@@ -38,6 +39,9 @@ class BakedScene:
             raise BakeError(
                 f"a bake of {bake.technique} cannot be rendered without its scene; a bake of LightFieldProbes can"
             )
+        places = {"bounds": Layout("float32 float64", (2, 3)), "offset": Layout("float64", (3,))}
+        wanted = {name: layout for name, layout in places.items() if name in bake.arrays}
+        check_layout(f"this bake of {bake.scene_name!r}", bake.arrays, wanted)
         self._guard = Guard()
         self.bake = bake
         self.name = bake.scene_name

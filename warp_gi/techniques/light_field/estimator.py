@@ -21,6 +21,7 @@ from warp_gi.primary import Primary
 from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.camera import Camera, CameraPath
+from warp_gi.techniques.light_field.arrays import check_arrays
 from warp_gi.techniques.light_field.settings import ProbeSettings
 from warp_gi.techniques.light_field.state import ProbeState, path_settings, sky_bytes
 from warp_gi.techniques.shared.lamps import lit_data
@@ -198,6 +199,7 @@ class LightFieldProbes(Estimator, RadianceCache):
             raise BakeError(
                 "this bake of probes is by an earlier version, whose rough surfaces were too bright: bake it again"
             )
+        check_arrays(bake, self.probe_settings)
         made_for, wanted = known_rows(bake.arrays["cameras"]), camera_rows(cameras_of(camera))
         known = (
             np.abs(wanted[:, None] - made_for).max(axis=2)
@@ -218,8 +220,12 @@ class LightFieldProbes(Estimator, RadianceCache):
         if bake.technique != "LightFieldProbes":
             raise BakeError(f"expected a bake of LightFieldProbes, got one of {bake.technique}")
         baked: dict[str, Any] = {**bake.settings}
-        baked["counts"] = tuple(int(count) for count in baked["counts"].split("x"))
-        return replace(self, **baked)
+        try:
+            baked["counts"] = tuple(int(count) for count in baked["counts"].split("x"))
+            fitting = replace(self, **baked)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:  # an OptionError is a ValueError
+            raise BakeError(f"this bake has settings that probes cannot have ({error}); bake it again") from error
+        return fitting
 
     # ---- frames ----
 

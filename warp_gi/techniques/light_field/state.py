@@ -20,6 +20,7 @@ from warp_gi.paths import sky_probability
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.scene import Scene
+from warp_gi.techniques.light_field.arrays import check_arrays
 from warp_gi.techniques.light_field.places import (
     ProbeGrid,
     place_grid,
@@ -97,6 +98,7 @@ class ProbeState:
             self.grid = place_grid(whole_scene(scene), settings, camera, device)
             bounds = scene.bounds
         else:
+            check_arrays(bake, settings)
             arrays = bake.arrays
             nx, ny, nz = (int(n) for n in arrays["grid_counts"])
             self.grid, bounds = ProbeGrid(arrays["grid_low"], arrays["grid_spacing"], (nx, ny, nz)), arrays["bounds"]
@@ -362,7 +364,7 @@ class ProbeState:
 def bounce_changes(bake: Bake) -> list[float]:
     """Return by how much each bounce changed the irradiance of probes, as a share of it; the first is 1."""
     count = sum(name.startswith("change_") for name in bake.counts)
-    return [float(bake.counts[f"change_{number + 1}"]) for number in range(count)]
+    return [float(bake.counts.get(f"change_{number + 1}", 0.0)) for number in range(count)]
 
 
 def path_settings(scene: Scene | BakedScene) -> path_trace.PathSettings:

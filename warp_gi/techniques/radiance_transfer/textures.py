@@ -57,6 +57,7 @@ def _is_whole(textures: TransferTextures) -> bool:
     wanted = {
         "corners": (np.float32, (0 if at_vertices else faces, 3, 2)),
         "face_pages": (np.int32, (faces,)),
+        "charts": (np.int32, (faces,)),
         "pages": (np.int32, (len(pages), 3)),
         "slots": (np.int32, (2, atlas.slots.shape[1])),
         "corner_slots": (np.int32, (2, faces, 3) if at_vertices else (0, 0, 3)),

@@ -25,6 +25,7 @@ from warp_gi.kernels import gbuffer
 from warp_gi.kernels import visibility_field as field_kernels
 from warp_gi.kernels import visibility_field_bake as bake_kernels
 from warp_gi.kernels import visibility_field_trace as trace_kernels
+from warp_gi.layout import Layout, check_layout, misfit
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.pinhole import camera_data
 from warp_gi.scene.scene import Scene
@@ -137,24 +138,28 @@ class FieldState:
     def from_bake(cls, scene: Scene, device: wp.Device, settings: MaskSettings, seed: int, bake: Bake) -> FieldState:
         """Return the state that a bake holds. Raises BakeError if it is not whole."""
         state = cls(scene, device, settings, seed)
-        try:
-            cells, flags = bake.arrays["cells"].astype(np.int32), bake.arrays["flags"].astype(np.int32)
-            masks, empty = bake.arrays["masks"], bake.arrays["empty_cells"]
-        except KeyError as missing:
-            raise BakeError(f"this bake of a visibility field has no array {missing}; bake it again") from None
-        named = np.concatenate([cells, empty])
-        in_grid = ((named >= 0) & (named < state.grid.cell_count)).all() and len(np.unique(cells)) == len(cells)
-        if masks.shape != (len(cells), state.words) or flags.shape != cells.shape or not in_grid:
-            raise BakeError(
-                f"this bake of a visibility field holds masks {masks.shape} for {len(cells)} cells of a grid of "
-                f"{state.grid.cell_count}, expected {state.words} words each; bake it again"
-            )
+        what = f"this bake of a visibility field in {bake.scene_name!r}"
+        check_layout(what, bake.arrays, state.layout(np.shape(bake.arrays.get("cells", ()))[:1] or (0,)))
+        cells, flags = (bake.arrays[name].astype(np.int32) for name in ("cells", "flags"))
+        masks, empty = bake.arrays["masks"], bake.arrays["empty_cells"]
+        if len(np.unique(cells)) != len(cells):
+            raise BakeError(f"{what} names a cell twice; bake it again")
         state._add(cells, masks.astype(np.uint32), flags)
         state.empty[empty] = True
         state._start_count, state._start_empty = len(cells), state.empty
         state.counts |= {name: int(bake.counts.get(name, 0)) for name in state.counts}
         state.seconds = float(bake.counts.get("seconds", 0.0))
         return state
+
+    def layout(self, cells: tuple[int, ...], prefix: str = "") -> dict[str, Layout]:
+        """Return what the arrays of so many cells have to be; ``prefix`` is that of their names."""
+        last, whole = self.grid.cell_count - 1, "int32 int64 uint32"
+        return {
+            f"{prefix}cells": Layout(whole, cells, 0, last),
+            f"{prefix}flags": Layout(whole, cells, 0, int(field_kernels.SLOT_LABEL)),
+            f"{prefix}masks": Layout("uint32", (*cells, self.words)),
+            f"{prefix}empty_cells": Layout(whole, (None,), 0, last),
+        }
 
     def to_bake(self) -> Bake:
         """Return the static layer as a bake, with the cells that frames added."""
@@ -191,6 +196,9 @@ class FieldState:
         """
         if arrays["start"].tobytes() != self._start_digest():
             raise ValueError("the field began with other cells")
+        wanted = self.layout(arrays["cells"].shape[:1]) | self.layout(arrays["settled_cells"].shape[:1], "settled_")
+        if problem := misfit(arrays, wanted):
+            raise ValueError(problem)
         state, count = self.copied(), self._start_count
         state.slots = self.slots.copy()
         state.slots[self.cells[count:]] = field_kernels.NO_SLOT
