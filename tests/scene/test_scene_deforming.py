@@ -127,6 +127,18 @@ def test_edits_are_told(what, in_use):
         scene.check_unchanged()
 
 
+@pytest.mark.parametrize("in_use", [False, True])
+def test_a_node_that_is_replaced_by_one_that_bends_otherwise_is_told(in_use):
+    scene = gi.Scene(flag())
+    if in_use:
+        scene.data("cpu")
+    scene.nodes[0] = replace(scene.nodes[0])
+    scene.check_unchanged()
+    scene.nodes[0] = replace(scene.nodes[0], morphs=[KEYS[0], gi.MorphKeyframe(2.0, (0.9,))])
+    with pytest.raises(SceneError, match="node 0 'flag' was replaced by another"):
+        scene.check_unchanged()
+
+
 def test_a_target_that_is_edited_in_place_is_told():
     scene = gi.Scene(flag())
     scene.data("cpu")

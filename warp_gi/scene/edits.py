@@ -137,6 +137,7 @@ class Edits:
         for index, (node, former) in enumerate(zip(now, old, strict=True)):
             if node is not former:
                 edit = self._meshes_edit(node) or self._placement_edit(node, "parent_from_node")
+                edit = edit or self._shape_edit("skin")
                 if edit is not None:
                     return Edit(f"node {index} {former.name!r} was replaced by another", edit.cure)
         return None
