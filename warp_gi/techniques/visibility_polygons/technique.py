@@ -15,4 +15,6 @@ TECHNIQUE = Technique(
         )
     },
     presets={"polygons": {"environment": "VisibilityPolygons"}},
+    bake_tool="bake_tool",
+    page="techniques/visibility_polygons.md",
 )
