@@ -116,9 +116,7 @@ def audit_polygons(first: wp.int32, scene: SceneData, sets: PolygonSets, lists: 
     wrong = int(0)
     for k in range(AUDIT_SIDE * AUDIT_SIDE):
         u = wp.vec2(wp.float32(k % AUDIT_SIDE), wp.float32(k / AUDIT_SIDE))
-        u = u + wp.vec2(
-            random_1d(wp.uint32(k), seed, OWN_DIMENSION), random_1d(wp.uint32(k), seed, OWN_DIMENSION + 1)
-        )
+        u = u + wp.vec2(random_1d(wp.uint32(k), seed, OWN_DIMENSION), random_1d(wp.uint32(k), seed, OWN_DIMENSION + 1))
         local = cosine_direction(u / wp.float32(AUDIT_SIDE))
         direction = frame * local
         seen = int(0)

@@ -120,9 +120,7 @@ def has_corner(bits: wp.int32, k: wp.int32) -> wp.bool:
 
 # Point where a contour crosses edge `k` of a cell, from its corner k that sees the sky to the next that does not.
 @wp.func
-def crossing(
-    scene: SceneData, batch: ContourBatch, local: wp.int32, x: wp.int32, y: wp.int32, k: wp.int32
-) -> wp.vec4:
+def crossing(scene: SceneData, batch: ContourBatch, local: wp.int32, x: wp.int32, y: wp.int32, k: wp.int32) -> wp.vec4:
     near = cell_corner(x, y, k)
     far = cell_corner(x, y, (k + 1) & 3)
     seen = node_place(near[0], near[1], batch.resolution)

@@ -1,4 +1,4 @@
-"""Which points of the contours of a triangle's three corners belong together (visibility_correspondence.txt, section 4).
+"""Which points of the contours of a triangle's corners belong together (visibility_correspondence.txt, section 4).
 
 Anchors are triples of points that are mutual nearest on all three edges, each edge judged at its middle, so that both
 triangles at an edge agree; those nearest together come first, and one that would cross others is left out. Between
@@ -154,9 +154,7 @@ def spread(batch: MatchBatch, item: wp.int32, triple: Triple, at: wp.vec3i) -> w
 
 # Place among `count` anchors, in cyclic order, after which a triple fits in without crossing any, or -1.
 @wp.func
-def anchor_place(
-    batch: MatchBatch, item: wp.int32, triple: Triple, candidate: wp.vec3i, count: wp.int32
-) -> wp.int32:
+def anchor_place(batch: MatchBatch, item: wp.int32, triple: Triple, candidate: wp.vec3i, count: wp.int32) -> wp.int32:
     place = int(-1)
     for j in range(count):
         low = batch.anchors[item * MOST_POINTS + j]

@@ -32,7 +32,9 @@ SKY_MAP = wp.constant(2)
 
 PI = wp.constant(wp.float32(3.141592653589793))
 TWO_PI = wp.constant(wp.float32(6.283185307179586))
-LONGEST_ARC = wp.constant(wp.float32(0.17453292519943295))  # 10 degrees: longer arcs leave the box of their ends too far
+LONGEST_ARC = wp.constant(
+    wp.float32(0.17453292519943295)
+)  # 10 degrees: longer arcs leave the box of their ends too far
 PARTS = wp.constant(1024)  # of an edge at most
 
 
@@ -44,7 +46,7 @@ class PolygonSky:
     tolerance: wp.float32  # luminance of irradiance, of the tables, by which an edge's two bounds may differ, halved
     rows: wp.int32  # cells of the summed-area table, 0 if there is none
     columns: wp.int32
-    # [((rows + 1) * (columns + 1)) * 3] integrals of l_x L, l_y L and l_z L over polar angles and azimuths below a node's
+    # [((rows + 1) * (columns + 1)) * 3] integrals of l_x L, l_y L, l_z L over polar angles and azimuths below a node
     table: wp.array(dtype=wp.vec3)
     height: wp.int32  # texels
     width: wp.int32
@@ -118,12 +120,10 @@ def column_part(sky: PolygonSky, column: wp.int32, p: wp.float32, t: wp.float32,
     above = sky.row_areas[row]
     below = sky.row_areas[row + 1]
     s = wp.clamp((0.5 * (t - sine * wp.cos(t)) - above[0]) / (below[0] - above[0]), 0.0, 1.0)
-    q = float(0.0)
-    if wp.abs(below[1] - above[1]) > 0.0:
-        q = (0.5 * sine * sine - above[1]) / (below[1] - above[1])
     at = (column * (sky.height + 1) + row) * 2
+    within = (sky.band_sums[at + 2] - sky.band_sums[at]) / (below[0] - above[0])  # radiance of the texel
     a = sky.band_sums[at] * (1.0 - s) + sky.band_sums[at + 2] * s
-    b = sky.band_sums[at + 1] * (1.0 - q) + sky.band_sums[at + 3] * q
+    b = sky.band_sums[at + 1] + within * (0.5 * sine * sine - above[1])
     return a * (n[0] * wp.sin(p) - n[2] * wp.cos(p)) + b * n[1]
 
 
@@ -250,7 +250,7 @@ def with_edge(sky: PolygonSky, sum: EdgeSum, a: wp.vec3, b: wp.vec3) -> EdgeSum:
     return r
 
 
-# n . integral of l L over the polygon, W/m^2. Which of zenith and nadir are inside: `turn` tells one from the other, and
+# n . integral of l L over the polygon, W/m^2. Which of zenith and nadir are inside: `turn` tells one from the other;
 # whether none or both are is looked up.
 @wp.func
 def polygon_light(sky: PolygonSky, sum: EdgeSum) -> wp.vec3:

@@ -1,4 +1,4 @@
-"""The sky's light that polygons do not know, by rays: on flagged triangles all of it, elsewhere that of glossy lobes."""
+"""Light of the sky that polygons do not know, by rays: all on flagged triangles, elsewhere that of glossy lobes."""
 
 import warp as wp
 

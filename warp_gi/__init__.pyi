@@ -63,6 +63,7 @@ from warp_gi.techniques.reuse.pictures import reuse_pictures as reuse_pictures
 from warp_gi.techniques.reuse.sample_octree import SampleOctree as SampleOctree
 from warp_gi.techniques.surface_cache.cache import SurfaceCache as SurfaceCache
 from warp_gi.techniques.visibility_field.estimator import VisibilityField as VisibilityField
+from warp_gi.techniques.visibility_polygons.estimator import VisibilityPolygons as VisibilityPolygons
 
 __version__: str
 __all__: list[str]

@@ -25,14 +25,14 @@ def city(height=32, seed=1):
 
 
 def integrate(environment, polygons, normals, evaluator="adaptive", tolerance=1e-3):
-    """Return irradiance through polygons in world space, float64 [polygon, 3]: each is a list of contours [point, 3]."""
+    """Return irradiance through polygons in world space, float64 [polygon, 3]: each a list of contours [point, 3]."""
     sky = polygon_sky(environment, evaluator, tolerance, device())
     turn = np.array(sky.sky_from_world, np.float64).reshape(3, 3)
     contours = [np.asarray(contour) @ turn.T for polygon in polygons for contour in polygon]
     plain = kernels.PlainPolygons()
-    ends = lambda counts: launch.on_device(np.concatenate([[0], np.cumsum(counts)]).astype(np.int32), wp.int32, device())  # noqa: E731
-    plain.starts = ends([len(polygon) for polygon in polygons])
-    plain.contour_starts = ends([len(contour) for contour in contours])
+    for name, parts in (("starts", polygons), ("contour_starts", contours)):
+        ends = np.cumsum([0, *(len(part) for part in parts)]).astype(np.int32)
+        setattr(plain, name, launch.on_device(ends, wp.int32, device()))
     plain.points = launch.on_device(np.concatenate(contours).astype(np.float32), wp.vec3, device())
     plain.normals = launch.on_device((np.asarray(normals) @ turn.T).astype(np.float32), wp.vec3, device())
     plain.light = wp.zeros(len(polygons), dtype=wp.vec3, device=device())

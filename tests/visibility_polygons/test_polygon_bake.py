@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import warp as wp
 from polygon_tools import circle_about, unit
 from scene_tools import quad
 from statistics_tools import device, every_device  # noqa: F401
@@ -36,7 +35,9 @@ def floor(count=6, size=3.0):
     x, z = np.meshgrid(edge, edge, indexing="ij")
     first = np.arange(count * (count + 1)).reshape(count, count + 1)[:, :-1].reshape(-1)
     n = count + 1
-    faces = np.concatenate([np.stack([first, first + 1, first + n + 1], 1), np.stack([first, first + n + 1, first + n], 1)])
+    faces = np.concatenate(
+        [np.stack([first, first + 1, first + n + 1], 1), np.stack([first, first + n + 1, first + n], 1)]
+    )
     return gi.Mesh(np.stack([x, 0 * x, z], -1).reshape(-1, 3).astype(np.float32), faces, GREY)
 
 
@@ -157,7 +158,9 @@ def matched(rings, corners):
     starts = np.concatenate([[0], np.cumsum([len(ring) for ring in rings])]).astype(np.int32)
     points = np.concatenate([np.column_stack([ring, np.zeros(len(ring))]) for ring in rings]).astype(np.float32)
     found = baking.Contours(np.arange(4, dtype=np.int32), starts, points, np.zeros(3, np.uint8))
-    sets = baking.sets_on(np.asarray(corners, np.float32), np.tile((0, 1, 0), (3, 1)).astype(np.float32), found, device())
+    sets = baking.sets_on(
+        np.asarray(corners, np.float32), np.tile((0, 1, 0), (3, 1)).astype(np.float32), found, device()
+    )
     arrays = baking.match_triangles(sets, np.array([[0, 1, 2]], np.int32), device())
     return (arrays["steps"][:, None] >> np.arange(3)) & 1, arrays["list_first"][0]
 
@@ -197,7 +200,10 @@ def cheapest(rings, first):
 def test_paths_cost_as_little_as_any(counts):
     """Where contours have no anchor but one, the path is the cheapest of all, found by trying every step."""
     rng = np.random.default_rng(sum(counts))
-    rings = [unit(circle_about((0, 1, 0), 0.9, count, 0.3 * k) + rng.normal(size=(count, 3)) * 0.03) for k, count in enumerate(counts)]
+    rings = [
+        unit(circle_about((0, 1, 0), 0.9, count, 0.3 * k) + rng.normal(size=(count, 3)) * 0.03)
+        for k, count in enumerate(counts)
+    ]
     steps, first = matched(rings, CORNERS)
     at = first + np.concatenate([[[0, 0, 0]], np.cumsum(steps, axis=0)])
     points = [ring[at[:, k] % counts[k]] for k, ring in enumerate(rings)]
@@ -257,12 +263,14 @@ def test_most_vertices_blind_is_told():
     closed += [quad((x, -1, -1), (0, 0, 2), (0, 2, 0), GREY) for x in (-1, 1)]
     closed += [quad((-1, -1, z), (2, 0, 0), (0, 2, 0), GREY) for z in (-1, 1)]
     inside = [quad((-0.5, y, 0.5), (1, 0, 0), (0, 0, -1), GREY) for y in (-0.6, -0.3, 0, 0.3, 0.6)]
-    with pytest.warns(UserWarning, match="of .* vertices see no sky: their pixels are traced; VisibilityField is faster"):
+    with pytest.warns(
+        UserWarning, match="of .* vertices see no sky: their pixels are traced; VisibilityField is faster"
+    ):
         baked(scene_of(*closed, *inside))
 
 
 def test_open_and_unwelded_surfaces():
-    """A closed ball has fronts alone, an open one both sides; corners at one place share a set, unless normals differ."""
+    """A closed ball has fronts alone, an open one both sides; corners at one place share a set if normals agree."""
     closed = corner_sets(scene_of(ball(1))._flat)
     assert (closed.corner_sets[80:] == -1).all() and len(closed.positions) == 42
     mesh = ball(1)
@@ -272,7 +280,10 @@ def test_open_and_unwelded_surfaces():
     fronts, backs = both.corner_sets[:79], both.corner_sets[79:]
     np.testing.assert_array_equal(both.normals[fronts], -both.normals[backs])
     soup = gi.Mesh(
-        mesh.points[mesh.indices].reshape(-1, 3), np.arange(240).reshape(-1, 3), GREY, normals=mesh.normals[mesh.indices].reshape(-1, 3)
+        mesh.points[mesh.indices].reshape(-1, 3),
+        np.arange(240).reshape(-1, 3),
+        GREY,
+        normals=mesh.normals[mesh.indices].reshape(-1, 3),
     )
     again = corner_sets(scene_of(soup)._flat)
     assert len(again.positions) == 42 and (again.corner_sets[80:] == -1).all()

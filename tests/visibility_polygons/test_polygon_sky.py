@@ -81,7 +81,7 @@ def test_both_evaluators_agree_as_the_sky_turns():
 
 def test_a_hole_takes_away_what_it_covers():
     normal = unit((0.3, 0.8, -0.2))
-    outer, inner = circle_about(normal), circle_about(unit(normal + (0.2, 0.1, 0)), 0.4)
+    outer, inner = circle_about(normal), circle_about(unit(normal + np.array((0.2, 0.1, 0))), 0.4)
     sky = gi.Environment(pixels=city())
     whole, hole, both = integrate(sky, [[outer], [inner], [outer, inner[::-1]]], [normal] * 3)
     np.testing.assert_allclose(both, whole - hole, rtol=1e-3)
@@ -114,4 +114,6 @@ def test_tables_hold_all_light():
     vertical = adaptive.table[-1, -1, 1] + adaptive.band_sums[:, -1, 1].sum(axis=0) * 2 * np.pi / adaptive.width
     np.testing.assert_allclose(vertical, adaptive.total[1], rtol=1e-4)
     np.testing.assert_allclose(exact.total, adaptive.total, rtol=1e-9)
-    np.testing.assert_allclose(row_areas(np.array([0.0, np.pi / 2, np.pi])), [[0, 0], [np.pi / 4, 0.5], [np.pi / 2, 0]], atol=1e-12)
+    np.testing.assert_allclose(
+        row_areas(np.array([0.0, np.pi / 2, np.pi])), [[0, 0], [np.pi / 4, 0.5], [np.pi / 2, 0]], atol=1e-12
+    )

@@ -1,4 +1,4 @@
-"""The bake of visibility polygons: contours of vertices, what of them belongs together over triangles, and its check."""
+"""The bake of visibility polygons: contours of vertices, what of them belongs together, and its check."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def bake_polygons(
 
     Counts are sets; sets that see nothing ("blind"), and those with too many contours ("complex"); points; rays of
     contours' maps; sides of triangles ("sides") and those that are traced or flagged; the mean error of those that are
-    not; and seconds of contours, correspondence and the check. One seed gives one result, whatever the number of threads.
+    not; and seconds of contours, correspondence and the check. One seed gives one result, on any number of threads.
 
     Raises SceneError where something moves, or nothing has an area.
     """
@@ -198,8 +198,8 @@ def find_contours(
         launch.launch(contour_kernels.gather_points, count, [batch, starts, points], device)
         found.append((counts[:, 1].copy(), sizes, points.numpy().copy(), counts[:, 2].copy()))
         progress((start + count) / total)
-    contours, sizes, points, states = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return Contours(_starts(contours), _starts(sizes), points, states.astype(np.uint8))
+    contours, sizes, all_points, states = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return Contours(_starts(contours), _starts(sizes), all_points, states.astype(np.uint8))
 
 
 def sets_on(positions: np.ndarray, normals: np.ndarray, contours: Contours, device: wp.Device) -> kernels.PolygonSets:
@@ -252,7 +252,7 @@ def match_triangles(
         launch.launch(match_kernels.gather_steps, count, [batch, step_starts, steps], device)
         found.append((counts, sizes, corners, starts, steps.numpy().copy()))
         progress((start + count) / total)
-    counts, sizes, corners, starts, steps = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    counts, sizes, corners, starts, all_steps = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return {
         "corner_sets": records,
         "states": counts[:, 2].astype(np.uint8),
@@ -260,7 +260,7 @@ def match_triangles(
         "list_contours": corners,
         "list_first": starts,
         "step_starts": _starts(sizes),
-        "steps": steps,
+        "steps": all_steps,
     }
 
 

@@ -18,15 +18,15 @@ ALIGNMENT = 16
 """Bytes that the place of an array in the file is a multiple of."""
 TEXT = {
     "arrays": "Each is at `offset` bytes in the file, little-endian, in rows of its `shape`.",
-    "sets": "What a vertex sees on one side: contours contour_starts[s] to contour_starts[s + 1] - 1. positions in metres, "
-    "y up, right-handed; normals unit. Contour c has the points point_starts[c] to point_starts[c + 1] - 1.",
+    "sets": "What a vertex sees on one side: contours contour_starts[s] to contour_starts[s + 1] - 1. positions in "
+    "metres, y up, right-handed; normals unit. Contour c has the points point_starts[c] to point_starts[c + 1] - 1.",
     "points": "(d, w): a unit direction from the vertex p and one over the distance of the occluder there, 0 for the "
     "horizon. From a point s it lies in direction d + w (p - s). What is visible lies to the left, seen from outside.",
     "records": "Fronts of all triangles, then backs. corner_sets are the sets of the corners, -1 where there is none. "
     "states: 0 traced (no set, nothing seen, or contours do not match), 1 interpolated, 2 flagged. errors: the largest "
     "share of light under a uniform sky that was wrong at points of the triangle.",
-    "lists": "Record r has the lists list_starts[r] to list_starts[r + 1] - 1, of one contour a corner: list_contours. The "
-    "polygon begins at the points list_first of them; each of the steps step_starts[l] to step_starts[l + 1] - 1 "
+    "lists": "Record r has the lists list_starts[r] to list_starts[r + 1] - 1, of one contour a corner: list_contours. "
+    "The polygon begins at the points list_first of them; each of the steps step_starts[l] to step_starts[l + 1] - 1 "
     "advances the contours whose bits (1, 2, 4) it has by one point, and the last comes back to the start. At each the "
     "polygon's direction is the mean of the three directions by barycentric weights, normalised.",
 }
@@ -81,5 +81,7 @@ def read_polygons(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, An
             count = int(np.prod(at["shape"]))
             arrays[name] = np.frombuffer(data, at["dtype"], count, at["offset"]).reshape(at["shape"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise BakeError(f"{path}: is no export of visibility polygons ({one_line(error)}); export them again") from error
+        raise BakeError(
+            f"{path}: is no export of visibility polygons ({one_line(error)}); export them again"
+        ) from error
     return arrays, info

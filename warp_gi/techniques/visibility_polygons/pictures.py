@@ -66,7 +66,9 @@ def write_pictures(
     reference = FrameScheduler(scene, camera, traced, device, seed).frame(0).numpy("beauty")
     error = np.abs(image.astype(np.float64) - reference).mean(-1)
     top = round_above(float(np.quantile(error, 0.99)) or 1.0)
-    told = f"RMSE {math.sqrt(np.mean(np.square(image.astype(np.float64) - reference))):.2g}, mean {reference.mean():.2g}"
+    told = (
+        f"RMSE {math.sqrt(np.mean(np.square(image.astype(np.float64) - reference))):.2g}, mean {reference.mean():.2g}"
+    )
     states = _state_picture(scene, bake, frame.hits.face.numpy(), frame.hits.direction.numpy(), camera.resolution)
     exposure = exposure_of(reference)
     pictures = {
@@ -118,7 +120,10 @@ def _polygon_picture(bake: Bake) -> np.ndarray:
             signed = float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
             drawn.append((abs(signed), signed < 0, center + radius * flat))
         for _, is_seen, outline in sorted(drawn, key=lambda entry: -entry[0]):
-            draw.polygon([tuple(at) for at in outline], fill=SEEN_COLOR if is_seen else HIDDEN_COLOR, outline=EDGE_COLOR)
+            draw.polygon(
+                [tuple(at) for at in outline], fill=SEEN_COLOR if is_seen else HIDDEN_COLOR, outline=EDGE_COLOR
+            )
     keys = ((SEEN_COLOR, "sky"), (HIDDEN_COLOR, "occluded"), (EDGE_COLOR, "contours"))
-    note = f"the hemispheres of {len(shown)} of {len(counts)} sets, those with most points: {int(counts[shown[0]])} at most"
+    most = int(counts[shown[0]])
+    note = f"the hemispheres of {len(shown)} of {len(counts)} sets, those with most points: up to {most}"
     return with_keys(np.asarray(canvas), keys, note)

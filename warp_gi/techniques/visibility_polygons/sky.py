@@ -14,8 +14,9 @@ from warp_gi.launch import on_device
 from warp_gi.scene.environment import Environment
 
 Evaluator = Literal["adaptive", "exact"]
-BRIGHT = 1e-3
-"""Share of the sky's flux above which a texel's excess is integrated exactly, in a band of columns."""
+BRIGHT, BRIGHT_MEANS = 1e-3, 8.0
+"""Share of the sky's flux above which a texel's excess is integrated exactly, in a band of columns; in means of texels,
+if that is more."""
 LEAST_ROWS = 128
 """Rows of the summed-area table at least; it has a quarter of the map's where that is more, and twice as many
 columns."""
@@ -61,7 +62,8 @@ def sky_tables(pixels: np.ndarray, evaluator: Evaluator) -> SkyTables:
     else:
         solid = (np.cos(polar[:-1]) - np.cos(polar[1:]))[:, None] * (2 * math.pi / width)
         flux = texels @ (0.2126, 0.7152, 0.0722) * solid
-        excess = texels * np.maximum(1.0 - BRIGHT * flux.sum() / np.maximum(flux, 1e-300), 0.0)[:, :, None]
+        most = max(BRIGHT, BRIGHT_MEANS / flux.size) * flux.sum()
+        excess = texels * np.maximum(1.0 - most / np.maximum(flux, 1e-300), 0.0)[:, :, None]
     columns = np.flatnonzero(excess.any(axis=(0, 2)))
     sums = np.zeros((len(columns), height + 1, 2, 3))
     parts = excess[:, columns, None, :] * np.diff(areas, axis=0)[:, None, :, None]
@@ -72,9 +74,7 @@ def sky_tables(pixels: np.ndarray, evaluator: Evaluator) -> SkyTables:
         rows = max(LEAST_ROWS, height // 4)
         ends = np.linspace(0.0, math.pi, rows + 1), np.linspace(0.0, 2 * math.pi, 2 * rows + 1)
         table = _summed(texels - excess, polar, areas, *ends).astype(np.float32)
-    return SkyTables(
-        table, areas.astype(np.float32), _bands(columns), sums.astype(np.float32), whole, width
-    )
+    return SkyTables(table, areas.astype(np.float32), _bands(columns), sums.astype(np.float32), whole, width)
 
 
 def row_areas(polar: np.ndarray) -> np.ndarray:
@@ -103,7 +103,9 @@ def _summed(
     row = np.minimum((rows / math.pi * height).astype(int), height - 1)
     by_row = []
     for k in range(2):
-        below = np.concatenate([np.zeros((1, width, 3)), np.cumsum(texels * np.diff(areas[:, k])[:, None, None], axis=0)])
+        below = np.concatenate(
+            [np.zeros((1, width, 3)), np.cumsum(texels * np.diff(areas[:, k])[:, None, None], axis=0)]
+        )
         by_row.append(below[row] + texels[row] * (row_areas(rows)[:, k] - areas[row, k])[:, None, None])
     azimuths = np.linspace(0.0, 2 * math.pi, width + 1)
     column = np.minimum((columns / (2 * math.pi) * width).astype(int), width - 1)

@@ -1,4 +1,4 @@
-"""Vertices that get polygons: a set for each position and normal, and another for surfaces that are seen from behind."""
+"""Vertices that get polygons: a set for each position and normal, and others for surfaces seen from behind."""
 
 from __future__ import annotations
 
