@@ -323,3 +323,38 @@ def test_clamped_parallax():
             assert (points[:, 3] <= 1.0001 / longest[one]).all()
             seen += int((points[:, 3] > 0).sum())
     assert seen > 100
+
+
+def times_covered(polygon, center, directions):
+    """How often a polygon covers directions, int [direction]: by the fan of triangles from a centre."""
+    count = np.zeros(len(directions), int)
+    for points in polygon:
+        for a, b in zip(points, np.roll(points, -1, axis=0), strict=True):
+            side = np.sign(center @ np.cross(a, b))
+            sides = directions @ np.stack([np.cross(center, a), np.cross(a, b), np.cross(b, center)], axis=1)
+            count += (side * (sides * side > 0).all(axis=1)).astype(int)
+    return count
+
+
+def test_the_check_finds_what_interpolation_gets_wrong():
+    """Nothing over a bare floor; over a coarse one under a ball what cosine-weighted rays find, in NumPy."""
+    assert baked(scene_of(floor(2))).arrays["errors"].max() < 0.01
+    scene = scene_of(floor(6), ball(2, (0.3, 0.8, 0.2), 0.4))
+    bake = baked(scene)
+    a, flat = bake.arrays, scene._flat
+    assert 0 < bake.counts["flagged"] < 0.5 * bake.counts["sides"]
+    triangles = flat.points[flat.indices].astype(np.float64)
+    fronts = a["states"][: len(triangles)]
+    rng = np.random.default_rng(6)
+    chosen = [*np.flatnonzero(fronts == kernels.FLAGGED)[:2], *np.flatnonzero(fronts == kernels.MATCHED)[:2]]
+    for record in chosen:
+        errors = []
+        for weights in (*(0.15 + 0.55 * np.eye(3)), np.full(3, 1 / 3)):
+            normal = unit(weights @ a["normals"][a["corner_sets"][record]])
+            directions = unit(normal + unit(rng.normal(size=(1500, 3))))
+            face = np.cross(triangles[record, 1] - triangles[record, 0], triangles[record, 2] - triangles[record, 0])
+            origin = weights @ triangles[record] + 1e-5 * unit(face)
+            seen = ~occluded(triangles, origin, directions) & (directions @ face > 0)
+            covered = times_covered(interpolated(bake, record, weights), normal, directions) > 0
+            errors.append(np.mean(covered != seen))
+        assert float(a["errors"][record]) == pytest.approx(max(errors), abs=0.025)
