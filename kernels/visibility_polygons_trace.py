@@ -6,17 +6,21 @@ from warp_gi.kernels.bsdf import Bsdf, bsdf_evaluate, bsdf_sample, diffuse_share
 from warp_gi.kernels.bvh import bvh_occluded
 from warp_gi.kernels.environment import environment_lookup, environment_sample
 from warp_gi.kernels.gbuffer import PassSettings, PrimaryHits, tiled_pixel
-from warp_gi.kernels.sampling import pixel_sample_index, pixel_seed, random_1d, sample_1d, sample_2d
+from warp_gi.kernels.sampling import (
+    POLYGON_DIRECTION_DIMENSION,
+    POLYGON_LOBE_DIMENSION,
+    POLYGON_SKY_DIMENSION,
+    pixel_sample_index,
+    pixel_seed,
+    random_1d,
+    sample_1d,
+    sample_2d,
+)
 from warp_gi.kernels.surface import Surface, ray_origin, surface_at
 from warp_gi.kernels.types import ENVIRONMENT_MAP, Geometry, SceneData
 from warp_gi.kernels.visibility_polygons import MATCHED, PolygonLists
 
 wp.set_module_options({"enable_backward": False})
-
-SKY_DIMENSION = wp.constant(3000)  # OWN_DIMENSION: the sky sample, its further digits (random),
-DIGITS_DIMENSION = wp.constant(3001)
-DIRECTION_DIMENSION = wp.constant(3002)  # the direction by the BSDF, and the lobe
-LOBE_DIMENSION = wp.constant(3003)
 
 
 @wp.struct
@@ -67,12 +71,15 @@ def traced_sample(
         direction = wp.vec3(0.0, 0.0, 0.0)
         if strategy == 0:
             if is_map:
-                u = sample_2d(index, seed, SKY_DIMENSION)
-                digits = random_1d(index, seed, DIGITS_DIMENSION)
+                u = sample_2d(index, seed, POLYGON_SKY_DIMENSION)
+                digits = random_1d(index, seed, POLYGON_SKY_DIMENSION)
                 direction = environment_sample(scene.environment, wp.vec3(u[0], u[1], digits)).direction
         else:
             b = bsdf_sample(
-                lobe, wo, sample_1d(index, seed, LOBE_DIMENSION), sample_2d(index, seed, DIRECTION_DIMENSION)
+                lobe,
+                wo,
+                sample_1d(index, seed, POLYGON_LOBE_DIMENSION),
+                sample_2d(index, seed, POLYGON_DIRECTION_DIMENSION),
             )
             if b.pdf > 0.0:
                 direction = s.shading * b.wi
