@@ -88,6 +88,11 @@ FIELD_LIGHT_DIMENSION = wp.constant(102)  # which light samples are verified (ra
 FIELD_LOBE_DIMENSION = wp.constant(103)  # which lobe of a glossy surface (random)
 FIELD_SET_DIMENSION = wp.constant(104)  # which set of light samples a pixel takes (random)
 
+# Pixels on which visibility polygons leave light to rays.
+POLYGON_SKY_DIMENSION = wp.constant(105)  # the sky sample; random: its further digits
+POLYGON_DIRECTION_DIMENSION = wp.constant(106)  # the direction by the BSDF
+POLYGON_LOBE_DIMENSION = wp.constant(107)  # and its lobe (1d)
+
 # Launches of techniques that have no lines here: from this dimension on, up to 999 of them.
 OWN_DIMENSION = wp.constant(3000)
 

@@ -66,6 +66,7 @@ from warp_gi.techniques.reuse.pictures import reuse_pictures as reuse_pictures
 from warp_gi.techniques.reuse.sample_octree import SampleOctree as SampleOctree
 from warp_gi.techniques.surface_cache.cache import SurfaceCache as SurfaceCache
 from warp_gi.techniques.visibility_field.estimator import VisibilityField as VisibilityField
+from warp_gi.techniques.visibility_polygons.estimator import VisibilityPolygons as VisibilityPolygons
 from warp_gi.verbosity import set_verbosity as set_verbosity
 
 __version__: str

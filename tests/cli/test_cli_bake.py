@@ -92,7 +92,10 @@ BAD = [
         [*BAKE, "--technique", "visibility-feild"],
         "unknown technique 'visibility-feild'; did you mean 'visibility-field'",
     ),
-    ([*BAKE, "--technique=field"], "(known: light-field-probes, radiance-transfer, surface-cache, visibility-field)"),
+    (
+        [*BAKE, "--technique=field"],
+        "(known: light-field-probes, radiance-transfer, surface-cache, visibility-field, visibility-polygons)",
+    ),
     (["bake", "cornel_box"], "did you mean 'cornell_box'?"),
     ([*BAKE, "--cel-size", "1"], "did you mean --cell-size?"),
     ([*BAKE, "--rays", "0"], "rays must be a whole number"),

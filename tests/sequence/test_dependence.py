@@ -66,6 +66,8 @@ def preset(name, **settings):
     pipeline = gi.Pipeline.preset(name, spp=2, camera_samples=2)
     if isinstance(pipeline.environment, gi.VisibilityField):
         pipeline = replace(pipeline, environment=FIELD)
+    if isinstance(pipeline.environment, gi.VisibilityPolygons):
+        pipeline = replace(pipeline, environment=gi.VisibilityPolygons(resolution=16))
     if isinstance(pipeline.indirect, gi.LightFieldProbes):
         pipeline = replace(pipeline, indirect=replace(PROBES, primary=pipeline.indirect.primary))
     if pipeline.indirect is not None and pipeline.indirect.radiance_cache is not None:
@@ -171,6 +173,8 @@ CASES = {
     "transfer": Case("", preset("transfer")),
     "transfer turning": Case("", preset("transfer"), turning=True),
     "transfer moving": Case("", replace(preset("transfer"), indirect=None), moving=True),
+    "polygons": Case("", preset("polygons")),
+    "polygons turning": Case("", preset("polygons"), turning=True),
     "probe_view": Case("", preset("probe_view")),
     "probe_view moving": Case("unsaved", preset("probe_view"), moving=True),
     "probe_view alone": Case("", preset("probe_view"), alone=True),
@@ -257,6 +261,8 @@ def test_frames_keep_what_their_pipeline_says(name, wholes):
 @pytest.mark.parametrize("name", CASES)
 def test_every_frame_alone_and_every_break(name, moving, turning, tmp_path):
     """In processes of their own, as far as that goes; after a break to the end; on 1, 2 and 3 threads by turns."""
+    if moving and isinstance(CASES[name].pipeline.environment, gi.VisibilityPolygons):
+        pytest.skip("visibility polygons refuse what moves")
     case = replace(CASES[name], moving=moving, turning=turning and not CASES[name].alone)
     if moving and isinstance(case.pipeline.indirect, gi.RadianceTransfer):  # the plate's lamp moves: it is refused
         case = replace(case, pipeline=replace(case.pipeline, indirect=None))

@@ -8,4 +8,5 @@ TECHNIQUES = (
     "reuse",
     "radiance_transfer",
     "surface_cache",
+    "visibility_polygons",
 )

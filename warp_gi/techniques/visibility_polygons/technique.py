@@ -1,0 +1,20 @@
+"""Visibility polygons (visibility_correspondence.txt)."""
+
+from warp_gi.registry import Claim, Entry, Technique
+
+TECHNIQUE = Technique(
+    name="visibility-polygons",
+    short="polygons",
+    estimators={
+        "VisibilityPolygons": Entry(
+            "estimator",
+            {
+                "": Claim(unbiased=False, bound=0.01),
+                "exact": Claim({"evaluator": "exact"}, unbiased=False, bound=0.01),
+            },
+        )
+    },
+    presets={"polygons": {"environment": "VisibilityPolygons"}},
+    bake_tool="bake_tool",
+    page="techniques/visibility_polygons.md",
+)
