@@ -36,8 +36,8 @@ def cpu_only(snippet: str, otherwise: str = "", **constants: float) -> str:
     return f"#if !defined(__CUDA_ARCH__)\n{snippet}\n#else\n{otherwise}\n#endif\n;"
 
 
-# Whether the alpha of `face` at barycentrics u, v is below the cutoff of its mask. Needs the arrays of Bvh in scope.
-TRANSPARENT = """
+# The alpha of `face` at barycentrics u, v. Needs the arrays of Bvh in scope.
+ALPHA = """
     const auto& mask = masks[face_masks[face]];
     const wp::vec3i corner = indices[face];
     float alpha = mask.factor;
@@ -74,8 +74,32 @@ TRANSPARENT = """
         }
         alpha *= sum * (1.0f / 255.0f);
     }
-    return alpha < mask.cutoff;
 """
+
+# Whether the ray passes through `face`: where its alpha is below the cutoff of its mask, or by chance, with the
+# probability 1 - alpha. Chance is a hash of the ray's own bits, of the triangle and of Bvh.salt. So queries for closest
+# and for any hit agree, triangles along a ray are independent, and no ray needs a state. Needs ALPHA's arrays in
+# scope, and the ray's `start` and `way`.
+TRANSPARENT = (
+    ALPHA
+    + """
+    if (mask.cutoff >= 0.0f) return alpha < mask.cutoff;
+    if (alpha >= 1.0f) return false;
+    union { float number; unsigned bits; } words[6];
+    for (int axis = 0; axis < 3; ++axis) {
+        words[axis].number = start[axis];
+        words[3 + axis].number = way[axis];
+    }
+    unsigned long long hash = (unsigned long long)salt << 32 | (unsigned)face;
+    for (int pair = 0; pair < 3; ++pair) {
+        hash ^= hash >> 29;
+        hash = hash * 0xBF58476D1CE4E5B9ull + ((unsigned long long)words[pair].bits << 32 | words[3 + pair].bits);
+    }
+    hash = (hash ^ hash >> 30) * 0xBF58476D1CE4E5B9ull;  // splitmix64
+    hash = (hash ^ hash >> 27) * 0x94D049BB133111EBull;
+    return (float)(unsigned)(hash >> 40) * 0x1p-24f >= alpha;
+"""
+)
 
 # Ray set-up, box test and triangle test, then the start of the query's struct. Rounding: boxes are enlarged when
 # they are filled in, the ray's far side moves out and its near side in by a bound on the error of
@@ -186,6 +210,8 @@ TRAVERSAL = (
         decltype(bvh.alphas.data) alphas;
         decltype(bvh.textures.data) textures;
         decltype(bvh.texels.data) texels;
+        unsigned salt;
+        float start[3], way[3];
 
         __attribute__((noinline, cold)) bool transparent(int face, float u, float v) const {%s}
         inline bool passes(int face, float u, float v) const {
@@ -204,7 +230,8 @@ TRAVERSAL = (
 QUERY = """
     const Query query = {
         (const char*)bvh.nodes.data, (const char*)bvh.blocks.data, bvh.face_masks.data, bvh.masks.data,
-        bvh.indices.data, bvh.uvs.data, bvh.alphas.data, bvh.textures.data, bvh.texels.data
+        bvh.indices.data, bvh.uvs.data, bvh.alphas.data, bvh.textures.data, bvh.texels.data,
+        bvh.salt, {origin[0], origin[1], origin[2]}, {direction[0], direction[1], direction[2]}
     };
     return query.run(origin[0], origin[1], origin[2], direction[0], direction[1], direction[2], t_max%s);
 """

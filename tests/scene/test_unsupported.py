@@ -78,10 +78,6 @@ def points(glb):
     glb.json["meshes"][0]["primitives"].append({"attributes": {"POSITION": 0}, "mode": 0})
 
 
-def blend(glb):
-    glb.json["materials"][0]["alphaMode"] = "BLEND"
-
-
 def weights_move(glb):
     sampler = {"input": glb.accessor([0.0, 1.0]), "output": glb.accessor([0.0, 1.0])}
     channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
@@ -91,7 +87,6 @@ def weights_move(glb):
 USES = {
     "COLOR_1": (attribute("COLOR_1", 3), r"COLOR_1 and above \(mesh 'tri'\)"),
     "points": (points, r"points and lines \(mesh 'tri'\)"),
-    "blend": (blend, r"alphaMode BLEND \(material 'm'\), which is approximated"),
     "weights": (weights_move, r"animation of morph weights \(animation 'wink'\)"),
     "skin": (lambda glb: glb.json["nodes"][0].update(skin=0), r"skins \(node 'n'\)"),
 }

@@ -69,9 +69,17 @@ class Material:
     normal_scale: float = 1.0
     """Factor on the x and y of the normal texture's normals."""
     alpha_cutoff: float | None = None
-    """Alpha below which a ray passes through the surface; None is opaque."""
+    """Alpha below which a ray passes through the surface; None is none."""
     double_sided: bool = True
     """Whether it emits on both sides. Every surface reflects and blocks light on both."""
+    alpha_blend: bool = False
+    """Whether alpha is the share of rays that the surface stops, as glTF's BLEND: each by chance, so that the mean is
+    right. Without it and without ``alpha_cutoff`` the surface is opaque."""
+
+    @property
+    def lets_rays_pass(self) -> bool:
+        """Whether its alpha counts."""
+        return self.alpha_blend or self.alpha_cutoff is not None
 
 
 @dataclass(eq=False)

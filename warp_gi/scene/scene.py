@@ -224,16 +224,16 @@ class Scene:
         if self._geometry_hash is None:
             digest = hashlib.sha256(b"warp_gi geometry 1")
             flat = self._flat
-            masked = np.array([m.alpha_cutoff is not None for m in self.materials])
+            masked = np.array([m.lets_rays_pass for m in self.materials])
             _update(digest, flat.points, flat.indices)
             if masked.any():
                 triangles = masked[flat.materials]
                 _update(digest, triangles, flat.materials[triangles], flat.uvs[flat.indices[triangles]])
                 if flat.colors is not None:
                     _update(digest, flat.colors[flat.indices[triangles], 3])
-                for material in (m for m in self.materials if m.alpha_cutoff is not None):
+                for material in (m for m in self.materials if m.lets_rays_pass):
                     texture = material.base_color_texture
-                    _update(digest, np.array([material.alpha, material.alpha_cutoff]))
+                    _update(digest, np.array([material.alpha, -1.0 if material.alpha_blend else material.alpha_cutoff]))
                     if texture is not None:
                         _update(digest, repr((texture.wrap, texture.nearest)), texture.pixels[..., 3])
             for index, node in enumerate(self.nodes):

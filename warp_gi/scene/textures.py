@@ -66,6 +66,8 @@ def check_material(material: Material) -> None:
     within("normal_scale", material.normal_scale, -1e6, 1e6)
     if material.alpha_cutoff is not None:
         within("alpha_cutoff", material.alpha_cutoff, 0.0, np.inf)
+        if material.alpha_blend:
+            raise SceneError(f"{owner}: has an alpha_cutoff and alpha_blend, which are two readings of alpha; keep one")
     for slot in TEXTURE_SLOTS:
         texture = getattr(material, slot)
         if texture is not None:
@@ -117,6 +119,7 @@ def material_table(materials: Sequence[Material], textures: Sequence[Texture]) -
         for label in NUMBERS:
             row[label] = getattr(material, label)
         row["alpha_cutoff"] = -1.0 if material.alpha_cutoff is None else material.alpha_cutoff
+        row["alpha_blend"] = int(material.alpha_blend)
         row["double_sided"] = int(material.double_sided)
         row["colors_emit"] = int(material.colors_emit)
         for slot in TEXTURE_SLOTS:

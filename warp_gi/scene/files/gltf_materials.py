@@ -16,7 +16,6 @@ from warp_gi.scene.files.images import find_file, read_image
 from warp_gi.scene.model import Color, Material, Texture
 
 WRAP_MODES = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
-BLEND_CUTOFF = 0.5
 NEAREST = 9728  # the one filter without interpolation between texels
 
 
@@ -94,6 +93,7 @@ class MaterialReader:
             reflectance_texture=slot.texture(coat, "specularColorTexture", True),
             normal_scale=document.number(normal, "scale", what, 1.0),
             alpha_cutoff=self._cutoff(source, what),
+            alpha_blend=source.get("alphaMode") == "BLEND",
             double_sided=bool(source.get("doubleSided")),
         )
         if old is not None:
@@ -165,9 +165,6 @@ class MaterialReader:
         mode = source.get("alphaMode", "OPAQUE")
         if mode not in ("OPAQUE", "MASK", "BLEND"):
             raise self.document.error(what, f"alphaMode must be OPAQUE, MASK or BLEND, got {mode!r:.60}")
-        if mode == "BLEND":
-            self.document.findings.add("alphaMode BLEND", what)
-            return BLEND_CUTOFF
         return self.document.number(source, "alphaCutoff", what, 0.5) if mode == "MASK" else None
 
     def texture(self, info: Part, srgb: bool, coordinates: Coordinates, what: str, material: str) -> Texture:
