@@ -7,7 +7,7 @@ direction's length, and pass through triangles where alpha lets them; only CUDA'
 
 import warp as wp
 
-from warp_gi.kernels.bvh_native import ALPHA, BLOCK_STEPS, INTERSECT, OCCLUDED, TRANSPARENT, cpu_only
+from warp_gi.kernels.bvh_native import ALPHA, BLOCK_STEPS, INTERSECT, OCCLUDED, THROUGH, TRANSPARENT, cpu_only
 from warp_gi.kernels.types import Bvh
 
 wp.set_module_options({"enable_backward": False})
@@ -34,27 +34,29 @@ ARRAYS = """
     const auto* alphas = bvh.alphas.data;
     const auto* textures = bvh.textures.data;
     const auto* texels = bvh.texels.data;
+    const auto* points = bvh.points.data;
 """
 
 
-COVERED = "return mask.cutoff < 0.0f ? wp::clamp(alpha, 0.0f, 1.0f) : (alpha < mask.cutoff ? 0.0f : 1.0f);\n"
-
-
 # Whether a ray that meets the masked triangle `face` at u, v passes through it.
-@wp.func_native(ARRAYS + "const unsigned salt = bvh.salt;\n" + TRANSPARENT)
+@wp.func_native(ARRAYS + "const unsigned salt = bvh.salt;\nconst int chance = bvh.chance;\n" + TRANSPARENT)
 def is_transparent(bvh: Bvh, face: wp.int32, u: wp.float32, v: wp.float32, start: wp.vec3, way: wp.vec3) -> wp.bool: ...
 
 
-# As coverage, in a tree whose `masks` and `solid_masks` have changed places (layers.py).
-@wp.func_native(
-    "if (!bvh.solid_masks.shape[0]) return 1.0f;\n" + ARRAYS.replace("bvh.masks", "bvh.solid_masks") + ALPHA + COVERED
-)
-def layer_coverage(bvh: Bvh, face: wp.int32, u: wp.float32, v: wp.float32) -> wp.float32: ...
-
-
-# Probability that a ray that meets the masked triangle `face` at u, v is stopped by it.
-@wp.func_native(ARRAYS + ALPHA + COVERED)
+# Share of the masked triangle `face` that is there at u, v, from 0 to 1.
+@wp.func_native(ARRAYS + ALPHA + "    return alpha;\n")
 def coverage(bvh: Bvh, face: wp.int32, u: wp.float32, v: wp.float32) -> wp.float32: ...
+
+
+# Share of the light which meets the triangle `face` along `way` that goes straight through it; 0 if it is no glass.
+@wp.func_native(
+    "if (!bvh.chance || bvh.face_masks.data[face] < 0) return 0.0f;\n"
+    + ARRAYS
+    + ALPHA
+    + THROUGH
+    + "    return alpha > 0.0f ? through : 0.0f;\n"
+)
+def transmitted(bvh: Bvh, face: wp.int32, u: wp.float32, v: wp.float32, way: wp.vec3) -> wp.float32: ...
 
 
 @wp.func_native(cpu_only(OCCLUDED, "return 0;"))

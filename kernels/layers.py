@@ -1,14 +1,13 @@
-"""Layers: all that a camera ray shows on its way through blended surfaces, where ray queries draw one by chance.
+"""Layers: all that a camera ray shows through blended surfaces and glass, of which ray queries draw one by chance.
 
 What a picture's readers and denoisers go by is the mean over the layers, so it has no noise: albedo, normals, coverage,
-emission. These kernels take a scene whose tree has `masks` and `solid_masks` in each other's place: blended triangles
-stop rays there (warp_gi/layers.py).
+emission. These kernels take a scene whose tree has `chance` 2: what lets rays pass by chance stops them all there.
 """
 
 import warp as wp
 
 from warp_gi.kernels.bsdf import average_specular
-from warp_gi.kernels.bvh import bvh_intersect, is_masked, layer_coverage
+from warp_gi.kernels.bvh import bvh_intersect, coverage, is_masked, transmitted
 from warp_gi.kernels.environment import environment_radiance
 from warp_gi.kernels.gbuffer import (
     CameraData,
@@ -57,8 +56,9 @@ def layers_along(scene: SceneData, start: wp.vec3, direction: wp.vec3) -> Layers
             break
         s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
         share = r.left
-        if is_masked(scene.bvh, hit.face):
-            share = r.left * layer_coverage(scene.bvh, hit.face, hit.u, hit.v)
+        if scene.bvh.chance != 0 and is_masked(scene.bvh, hit.face):
+            stops = 1.0 - transmitted(scene.bvh, hit.face, hit.u, hit.v, direction)
+            share = r.left * stops * coverage(scene.bvh, hit.face, hit.u, hit.v)
             if r.left - share < LEAST_LEFT:
                 share = r.left
         r.left = r.left - share

@@ -49,7 +49,9 @@ class Material:
     normal_scale: wp.float32
     emission: wp.vec3  # radiance
     alpha_cutoff: wp.float32  # negative: no mask
-    alpha_blend: wp.int32  # 1: rays pass by chance
+    alpha_blend: wp.int32  # 1: alpha is the share of rays that it stops
+    transmission: wp.float32  # share of the light that is not reflected which goes straight through, tinted
+    transmission_texture: wp.int32  # R factor on transmission
     double_sided: wp.int32  # 1: emits on both sides (every surface reflects on both)
     base_color_texture: wp.int32  # RGB base colour, A coverage
     metallic_roughness_texture: wp.int32  # G roughness, B metallic
@@ -124,13 +126,17 @@ class Emitters:
     upper: wp.vec3
 
 
-# One way in which triangles let rays pass: where the texture's alpha times `factor` is below `cutoff`, or, where there
-# is no cutoff, by chance, with the probability 1 - alpha.
+# One way in which triangles let rays pass. Their coverage is the texture's alpha times `factor`, or 0 below `cutoff`
+# and 1 above it; rays pass by chance, with the probability 1 - coverage (1 - what glass lets through).
 @wp.struct
 class AlphaMask:
     texture: wp.int32  # in Bvh.textures; its alpha is 1 where there is none
     factor: wp.float32
-    cutoff: wp.float32  # negative: by chance
+    cutoff: wp.float32  # negative: none
+    through: wp.float32  # of glass: its transmission times the luminance of its tint; 0 is none
+    through_texture: wp.int32  # in Bvh.textures; its alpha is a factor on `through`
+    f0: wp.float32  # of glass: what it reflects at normal incidence and at grazing angles
+    f90: wp.float32
 
 
 # What a ray query needs; see bvh.py. The CPU reads nodes and blocks, CUDA reads mesh.
@@ -142,8 +148,8 @@ class Bvh:
     parents: wp.array(dtype=wp.int32)  # [block] the node above it
     face_masks: wp.array(dtype=wp.int32)  # [triangle] index in masks, -1 is opaque; empty where all are
     masks: wp.array(dtype=AlphaMask)
-    # masks without chance, which let rays pass where the alpha is 0 alone; empty where no mask has chance
-    solid_masks: wp.array(dtype=AlphaMask)
+    points: wp.array(dtype=wp.vec3)  # [vertex] for glass; empty without it
+    chance: wp.int32  # 1: some masks let rays pass by chance; 2: they do not now, for layers.py; 0: none does
     salt: wp.uint32  # of chance; another one for each camera sample
     indices: wp.array(dtype=wp.vec3i)  # [triangle] for uvs; empty where all are opaque
     uvs: wp.array(dtype=wp.vec2)  # [vertex]

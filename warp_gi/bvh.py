@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import mmap
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ MOST_TASKS = 1024
 ORDERED_RAYS = 1 << 15  # rays are ordered before they are traced if a batch has at least so many
 ORDERED_BYTES = 1 << 25  # and the tree has at least so many bytes
 HUGE_PAGE = 1 << 21  # bytes
-SEEN_ALPHA = 1e-4  # below it a blended triangle is no layer that a camera ray shows
+NO_GLASS = (0.0, -1, 0.0, 0.0)
 
 
 @dataclass(eq=False)
@@ -43,6 +43,9 @@ class AlphaMasks:
     """Texels of all textures, uint32 RGBA8 [texel] with red in the low byte, on the tree's device."""
     alphas: np.ndarray | None = None
     """Coverage of vertices, multiplied with that of textures, float32 [vertex]; None is 1."""
+    glass: Mapping[int, tuple[float, int, float, float]] = field(default_factory=dict)
+    """Masks, by their index, of surfaces that light goes straight through: (share of it, index of the texture whose
+    alpha is a factor on it or -1, reflectance at normal incidence, reflectance at grazing angles)."""
 
 
 @dataclass(eq=False)
@@ -177,12 +180,12 @@ class TriangleBvh:
         for i, (texture, factor, cutoff) in enumerate(alpha.masks):
             if not -1 <= texture < len(alpha.textures):
                 raise SceneError(f"alpha mask {i} names texture {texture}, but there are {len(alpha.textures)}")
-            masks[i] = (texture, factor, -1.0 if cutoff is None else cutoff)
+            masks[i] = (texture, factor, -1.0 if cutoff is None else cutoff, *alpha.glass.get(i, NO_GLASS))
         self.data.face_masks = wp.array(face_mask, dtype=wp.int32, device=self.device)
         self.data.masks = wp.array(masks, dtype=types.AlphaMask, device=self.device)
-        if (masks["cutoff"] < 0.0).any():
-            masks["cutoff"] = np.where(masks["cutoff"] < 0.0, SEEN_ALPHA, masks["cutoff"])
-            self.data.solid_masks = wp.array(masks, dtype=types.AlphaMask, device=self.device)
+        self.data.chance = int(bool((masks["cutoff"] < 0.0).any() or alpha.glass))
+        if alpha.glass:
+            self.data.points = self._positions
         self.data.uvs = wp.array(uvs, dtype=wp.vec2, device=self.device)
         if alpha.alphas is not None:
             self.data.alphas = wp.array(np.asarray(alpha.alphas, np.float32), dtype=wp.float32, device=self.device)

@@ -10,19 +10,16 @@ from warp_gi.kernels import layers, types
 
 def has_layers(data: types.SceneData) -> bool:
     """Return whether a scene has surfaces that let rays pass by chance."""
-    return data.bvh.solid_masks is not None and len(data.bvh.solid_masks) > 0
+    return data.bvh.chance != 0
 
 
 def solid_data(data: types.SceneData) -> types.SceneData:
-    """Return a scene where rays stop at blended surfaces, which kernels/layers.py walks through; or the scene itself.
-
-    Its tree has ``masks`` and ``solid_masks`` in each other's place.
-    """
+    """Return a scene where rays stop at every layer, which kernels/layers.py walks through; or the scene itself."""
     if not has_layers(data):
         return data
     solid = launch.copied(data, types.SceneData)
     solid.bvh = launch.copied(data.bvh, types.Bvh)
-    solid.bvh.masks, solid.bvh.solid_masks = data.bvh.solid_masks, data.bvh.masks
+    solid.bvh.chance = 2
     return solid
 
 

@@ -36,7 +36,7 @@ class CameraRays(Primary):
 
     def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
         """Return the kernel that shades hits."""
-        blends = scene is not None and any(one.alpha_blend for one in whole_scene(scene).materials)
+        blends = scene is not None and any(one.has_chance for one in whole_scene(scene).materials)
         return (layers.shade_layers if blends else gbuffer.shade_primary,)
 
     def trace(self, frame: Frame, state: Any) -> None:

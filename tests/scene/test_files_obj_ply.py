@@ -166,6 +166,15 @@ def test_coverage_between_0_and_1_is_blended(statement, tmp_path):
     assert (found.alpha, found.alpha_blend, found.alpha_cutoff) == (0.25, True, None)
 
 
+@pytest.mark.parametrize("illum", [4, 6, 7, 9])
+def test_glass_of_mtl_is_a_pane(illum, tmp_path):
+    with pytest.warns(gi.UnsupportedWarning, match="glass of MTL"):
+        found = material(tmp_path, f"Kd 0 0 0\nd 0.1\nNi 1.52\nTf 0.5 0.75 1\nillum {illum}\n")
+    assert found.transmission == pytest.approx(0.9) and found.base_color == (0.5, 0.75, 1.0) and found.roughness == 0
+    assert found.reflectance == pytest.approx([(0.52 / 2.52) ** 2] * 3)
+    assert found.alpha == 1.0 and not found.alpha_blend
+
+
 @pytest.mark.parametrize(("middle", "factor", "blends"), [(0, 1, False), (1, 1, True), (0, 0.5, True)])
 def test_maps_of_holes_alone_are_cut_and_others_blended(middle, factor, blends, tmp_path):
     """Whether a fifth of the texels are neither hole nor surface, or the map has a factor."""

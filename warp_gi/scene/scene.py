@@ -232,10 +232,7 @@ class Scene:
                 if flat.colors is not None:
                     _update(digest, flat.colors[flat.indices[triangles], 3])
                 for material in (m for m in self.materials if m.lets_rays_pass):
-                    texture = material.base_color_texture
-                    _update(digest, np.array([material.alpha, -1.0 if material.alpha_blend else material.alpha_cutoff]))
-                    if texture is not None:
-                        _update(digest, repr((texture.wrap, texture.nearest)), texture.pixels[..., 3])
+                    _update(digest, *textures.visibility_parts(material))
             for index, node in enumerate(self.nodes):
                 if self._moving[index]:
                     keys = [asdict(key) for key in node.keyframes or ()]

@@ -20,13 +20,13 @@ from pathlib import Path
 import numpy as np
 
 from warp_gi.errors import SceneError
+from warp_gi.scene.files.glass import GREY_STEP, has_colored_tint
 from warp_gi.scene.files.images import find_file, read_image
 from warp_gi.scene.files.support import Findings
 from warp_gi.scene.files.text import decode, joined, read_bytes, uncommented, without_comment
 from warp_gi.scene.model import Material, Texture
 
 METAL_SPECULAR = 0.25
-GREY_STEP = 0.02  # difference between channels below which a colour is grey
 OPTION_ARGUMENTS = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}
 """Number of arguments of MTL map options that take more or fewer than one."""
 MAP_FEATURES = {
@@ -41,13 +41,13 @@ MAP_FEATURES = {
     **dict.fromkeys(("map_ps", "map_pc", "map_pcr", "map_aniso"), "sheen, clear coats and anisotropy of MTL"),
 }
 NUMBER_FEATURES = dict.fromkeys(("ps", "pc", "aniso"), "sheen, clear coats and anisotropy of MTL")
-COLORS = ("kd", "ks", "ke")
+COLORS = ("kd", "ks", "ke", "tf")
 HOLE = 24  # of 255, the alpha up to which a texel is one of a hole
 MOST_BETWEEN = 0.1  # share of texels that are neither hole nor surface in a map that is cut at 0.5
-NUMBERS = {*COLORS, *NUMBER_FEATURES, "ns", "d", "tr", "pr", "pm", "illum"}
+NUMBERS = {*COLORS, *NUMBER_FEATURES, "ns", "ni", "d", "tr", "pr", "pm", "illum"}
 MAPS = ("map_kd", "map_d", "map_ke", "map_emissive", "norm", "map_pr", "map_pm")
 """Maps that are read, in the order in which their scale and offset count."""
-UNSEEN = {"ka", "map_ka", "ni", "sharpness", "map_aat", "pcr", "anisor"}
+UNSEEN = {"ka", "map_ka", "sharpness", "map_aat", "pcr", "anisor"}
 """Statements without a warning: ambient light is computed, and the others change no picture by themselves."""
 GLASS_MODELS = (4, 6, 7, 9)  # values of illum
 ELSEWHERE = re.compile(r"[A-Za-z]:[\\/]|\\\\|/|~")
@@ -79,7 +79,7 @@ class MtlMaterial:
                 self.unread.append(("statements of MTL without the numbers they need", f"{' '.join(words)!r}, {where}"))
             else:
                 self.numbers[key] = values
-        elif key not in UNSEEN and not (key == "tf" and all(_number(word) == 1.0 for word in uncommented(words)[1:])):
+        elif key not in UNSEEN:
             self.unread.append((f"{words[0]} of MTL", where))
 
 
@@ -144,6 +144,8 @@ class MtlReader:
         elif "map_kd" not in maps and _is_metal(diffuse, specular):
             diffuse, metallic, factor = specular, 1.0, 1.0
         red, green, blue = diffuse.tolist()
+        if self._is_glass(source):
+            return self._glass(name, source), self._transform(name, source)
         material = Material(
             name,
             base_color=(red, green, blue),
@@ -164,6 +166,29 @@ class MtlReader:
         )
         return material, self._transform(name, source)
 
+    def _is_glass(self, source: MtlMaterial) -> bool:
+        is_clear = "map_d" not in source.maps and _coverage(source.numbers) < 1.0
+        return is_clear and int(_first(source.numbers, "illum", 2.0)) in GLASS_MODELS
+
+    def _glass(self, name: str, source: MtlMaterial) -> Material:
+        """Return a pane that reflects as its index of refraction ``Ni`` says, tinted by ``Tf``."""
+        numbers = source.numbers
+        red, green, blue = _color(numbers, "tf", 1.0).tolist()
+        index = _first(numbers, "ni", 1.5)
+        reflectance = ((index - 1.0) / (index + 1.0)) ** 2 if index > 1.0 else 0.04
+        shininess = _first(numbers, "ns", np.inf)
+        result = Material(
+            name,
+            base_color=(red, green, blue),
+            roughness=float((2.0 / (max(shininess, 0.0) + 2.0)) ** 0.25),
+            reflectance=(reflectance,) * 3,
+            normal_texture=self._texture(name, source, "norm", srgb=False),
+            transmission=1.0 - _coverage(numbers),
+        )
+        if has_colored_tint(result):
+            self.findings.add("colours of glass", f"material {name!r}")
+        return result
+
     def _note(self, name: str, source: MtlMaterial) -> None:
         """Note statements that are not read in full."""
         what = f"material {name!r}"
@@ -175,6 +200,8 @@ class MtlReader:
         for key, feature in NUMBER_FEATURES.items():
             if _first(source.numbers, key, 0.0) > 0.0:
                 self.findings.add(feature, what)
+        if min(_color(source.numbers, "tf", 1.0)) < 1.0 and not self._is_glass(source):
+            self.findings.add("Tf of MTL", what)
         if int(_first(source.numbers, "illum", 2.0)) in GLASS_MODELS:
             self.findings.add("glass of MTL (illum 4, 6, 7, 9)", what)
 
