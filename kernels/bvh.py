@@ -48,15 +48,27 @@ def is_transparent(bvh: Bvh, face: wp.int32, u: wp.float32, v: wp.float32, start
 def coverage(bvh: Bvh, face: wp.int32, u: wp.float32, v: wp.float32) -> wp.float32: ...
 
 
-# Share of the light which meets the triangle `face` along `way` that goes straight through it; 0 if it is no glass.
+GLASS = ARRAYS + ALPHA + THROUGH + "    return alpha > 0.0f ? wp::vec2(through, entering) : wp::vec2();\n"
+
+
+# Share of the light which meets the triangle `face` along `way` that goes straight through it, and what that would be
+# without a reflection; 0 if it is no glass. A call on the CPU, as most scenes have no glass.
 @wp.func_native(
-    "if (!bvh.chance || bvh.face_masks.data[face] < 0) return 0.0f;\n"
-    + ARRAYS
-    + ALPHA
-    + THROUGH
-    + "    return alpha > 0.0f ? through : 0.0f;\n"
+    "if (!bvh.chance || bvh.face_masks.data[face] < 0) return wp::vec2();\n"
+    + cpu_only(
+        """
+    struct Rare {
+        static __attribute__((noinline, cold)) wp::vec2 run(
+            const wp::remove_reference<decltype(bvh)>::type& bvh, int face, float u, float v, const wp::vec3& way
+        ) {%s}
+    };
+    return Rare::run(bvh, face, u, v, way);
+"""
+        % GLASS,
+        GLASS,
+    )
 )
-def transmitted(bvh: Bvh, face: wp.int32, u: wp.float32, v: wp.float32, way: wp.vec3) -> wp.float32: ...
+def transmitted(bvh: Bvh, face: wp.int32, u: wp.float32, v: wp.float32, way: wp.vec3) -> wp.vec2: ...
 
 
 @wp.func_native(cpu_only(OCCLUDED, "return 0;"))

@@ -81,11 +81,12 @@ ALPHA = """
 
 # What goes straight through glass in the direction `way`, of the light that meets its surface: what its one interface
 # does not reflect (Schlick's Fresnel term on the triangle's plane), times its transmission and the luminance of its
-# tint, as in KHR_materials_transmission. Follows ALPHA.
+# tint, as in KHR_materials_transmission; and `entering`, the same without Fresnel's term. Follows ALPHA.
 THROUGH = """
-    float through = mask.through;
+    float through = mask.through, entering = 0.0f;
     if (through > 0.0f) {
         if (mask.through_texture >= 0) through *= texture_alpha(mask.through_texture);
+        entering = through;
         const wp::vec3 p0 = points[corner[0]], p1 = points[corner[1]], p2 = points[corner[2]];
         const float ax = p1[0] - p0[0], ay = p1[1] - p0[1], az = p1[2] - p0[2];
         const float bx = p2[0] - p0[0], by = p2[1] - p0[1], bz = p2[2] - p0[2];

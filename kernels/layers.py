@@ -57,7 +57,7 @@ def layers_along(scene: SceneData, start: wp.vec3, direction: wp.vec3) -> Layers
         s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
         share = r.left
         if scene.bvh.chance != 0 and is_masked(scene.bvh, hit.face):
-            stops = 1.0 - transmitted(scene.bvh, hit.face, hit.u, hit.v, direction)
+            stops = 1.0 - transmitted(scene.bvh, hit.face, hit.u, hit.v, direction)[0]
             share = r.left * stops * coverage(scene.bvh, hit.face, hit.u, hit.v)
             if r.left - share < LEAST_LEFT:
                 share = r.left
