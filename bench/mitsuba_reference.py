@@ -66,7 +66,7 @@ def reference(name: str, renderings: int, spp: int) -> tuple[np.ndarray, np.ndar
     """Return mean and variance of the mean, float64 [height, width, 3]."""
     mi, picture = load_mitsuba(), PICTURES[name]
     scene = picture.scene()
-    masks = any(material.alpha_cutoff is not None for material in scene.materials)
+    masks = any(material.lets_rays_pass for material in scene.materials)
     peer, paths = to_mitsuba(scene, picture.camera()), integrator(picture.max_depth, masks)
     rendered = [np.array(mi.render(peer, integrator=paths, spp=spp, seed=1000 + i)) for i in range(renderings)]
     images = np.stack(rendered).astype(np.float64)

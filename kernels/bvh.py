@@ -2,12 +2,12 @@
 
 On the CPU a ray walks an eight-wide tree (built by bvh_build.py) in native code with clang's portable vector types;
 on CUDA it asks the ``wp.Mesh``. Both count hits with 0 < t < t_max on either side of a triangle, t in units of the
-direction's length, and pass through alpha-masked texels; only CUDA's any-hit query counts t = 0 as well.
+direction's length, and pass through triangles where alpha lets them; only CUDA's any-hit query counts t = 0 as well.
 """
 
 import warp as wp
 
-from warp_gi.kernels.bvh_native import BLOCK_STEPS, INTERSECT, OCCLUDED, TRANSPARENT, cpu_only
+from warp_gi.kernels.bvh_native import ALPHA, BLOCK_STEPS, INTERSECT, OCCLUDED, THROUGH, TRANSPARENT, cpu_only
 from warp_gi.kernels.types import Bvh
 
 wp.set_module_options({"enable_backward": False})
@@ -26,8 +26,7 @@ class BvhHit:
 def runs_on_cuda() -> wp.int32: ...
 
 
-@wp.func_native(
-    """
+ARRAYS = """
     const auto* face_masks = bvh.face_masks.data;
     const auto* masks = bvh.masks.data;
     const auto* indices = bvh.indices.data;
@@ -35,10 +34,41 @@ def runs_on_cuda() -> wp.int32: ...
     const auto* alphas = bvh.alphas.data;
     const auto* textures = bvh.textures.data;
     const auto* texels = bvh.texels.data;
-    """
-    + TRANSPARENT
+    const auto* points = bvh.points.data;
+"""
+
+
+# Whether a ray that meets the masked triangle `face` at u, v passes through it.
+@wp.func_native(ARRAYS + "const unsigned salt = bvh.salt;\nconst int chance = bvh.chance;\n" + TRANSPARENT)
+def is_transparent(bvh: Bvh, face: wp.int32, u: wp.float32, v: wp.float32, start: wp.vec3, way: wp.vec3) -> wp.bool: ...
+
+
+# Share of the masked triangle `face` that is there at u, v, from 0 to 1.
+@wp.func_native(ARRAYS + ALPHA + "    return alpha;\n")
+def coverage(bvh: Bvh, face: wp.int32, u: wp.float32, v: wp.float32) -> wp.float32: ...
+
+
+GLASS = ARRAYS + ALPHA + THROUGH + "    return alpha > 0.0f ? wp::vec2(through, entering) : wp::vec2();\n"
+
+
+# Share of the light which meets the triangle `face` along `way` that goes straight through it, and what that would be
+# without a reflection; 0 if it is no glass. A call on the CPU, as most scenes have no glass.
+@wp.func_native(
+    "if (!bvh.chance || bvh.face_masks.data[face] < 0) return wp::vec2();\n"
+    + cpu_only(
+        """
+    struct Rare {
+        static __attribute__((noinline, cold)) wp::vec2 run(
+            const wp::remove_reference<decltype(bvh)>::type& bvh, int face, float u, float v, const wp::vec3& way
+        ) {%s}
+    };
+    return Rare::run(bvh, face, u, v, way);
+"""
+        % GLASS,
+        GLASS,
+    )
 )
-def is_transparent(bvh: Bvh, face: wp.int32, u: wp.float32, v: wp.float32) -> wp.bool: ...
+def transmitted(bvh: Bvh, face: wp.int32, u: wp.float32, v: wp.float32, way: wp.vec3) -> wp.vec2: ...
 
 
 @wp.func_native(cpu_only(OCCLUDED, "return 0;"))
@@ -108,7 +138,7 @@ def masked_mesh_intersect(
         if h[0] > 0.0 and h[0] < hit.t:
             passed = bool(False)
             if is_masked(bvh, face):
-                passed = is_transparent(bvh, face, h[1], h[2])
+                passed = is_transparent(bvh, face, h[1], h[2], origin, direction)
             if not passed:
                 hit = BvhHit(h[0], h[1], h[2], face)
                 if any_hit != 0:

@@ -36,14 +36,13 @@ def cpu_only(snippet: str, otherwise: str = "", **constants: float) -> str:
     return f"#if !defined(__CUDA_ARCH__)\n{snippet}\n#else\n{otherwise}\n#endif\n;"
 
 
-# Whether the alpha of `face` at barycentrics u, v is below the cutoff of its mask. Needs the arrays of Bvh in scope.
-TRANSPARENT = """
+# The coverage of `face` at barycentrics u, v: its alpha, or 0 or 1 where its mask has a cutoff. Needs the arrays of Bvh
+# in scope.
+ALPHA = """
     const auto& mask = masks[face_masks[face]];
     const wp::vec3i corner = indices[face];
-    float alpha = mask.factor;
-    if (alphas) alpha *= (1.0f - u - v) * alphas[corner[0]] + u * alphas[corner[1]] + v * alphas[corner[2]];
-    if (mask.texture >= 0) {
-        const auto& texture = textures[mask.texture];
+    const auto texture_alpha = [&](int index) -> float {
+        const auto& texture = textures[index];
         const wp::vec2 uv0 = uvs[corner[0]], uv1 = uvs[corner[1]], uv2 = uvs[corner[2]];
         int texel[2][2];  // axis, lower and upper neighbour
         float fraction[2];
@@ -72,10 +71,66 @@ TRANSPARENT = """
             const int at = texture.start + texel[1][up] * texture.width + texel[0][right];
             sum += weight * (float)(texels[at] >> 24);
         }
-        alpha *= sum * (1.0f / 255.0f);
-    }
-    return alpha < mask.cutoff;
+        return sum * (1.0f / 255.0f);
+    };
+    float alpha = mask.factor;
+    if (alphas) alpha *= (1.0f - u - v) * alphas[corner[0]] + u * alphas[corner[1]] + v * alphas[corner[2]];
+    if (mask.texture >= 0) alpha *= texture_alpha(mask.texture);
+    if (mask.cutoff >= 0.0f) alpha = alpha < mask.cutoff ? 0.0f : 1.0f;
 """
+
+# What goes straight through glass in the direction `way`, of the light that meets its surface: what its one interface
+# does not reflect (Schlick's Fresnel term on the triangle's plane), times its transmission and the luminance of its
+# tint, as in KHR_materials_transmission; and `entering`, the same without Fresnel's term. Follows ALPHA.
+THROUGH = """
+    float through = mask.through, entering = 0.0f;
+    if (through > 0.0f) {
+        if (mask.through_texture >= 0) through *= texture_alpha(mask.through_texture);
+        entering = through;
+        const wp::vec3 p0 = points[corner[0]], p1 = points[corner[1]], p2 = points[corner[2]];
+        const float ax = p1[0] - p0[0], ay = p1[1] - p0[1], az = p1[2] - p0[2];
+        const float bx = p2[0] - p0[0], by = p2[1] - p0[1], bz = p2[2] - p0[2];
+        const float nx = ay * bz - az * by, ny = az * bx - ax * bz, nz = ax * by - ay * bx;
+        const float facing = nx * way[0] + ny * way[1] + nz * way[2];
+        const float length = (nx * nx + ny * ny + nz * nz) * (way[0] * way[0] + way[1] * way[1] + way[2] * way[2]);
+        const float cosine = wp::min(wp::abs(facing) / wp::sqrt(wp::max(length, 1e-37f)), 1.0f);
+        const float m = 1.0f - cosine, m2 = m * m, s = m2 * m2 * m;
+        through *= 1.0f - wp::min(mask.f0 + (mask.f90 - mask.f0) * s, 1.0f);
+    }
+"""
+
+# Whether the ray passes through `face`: by chance, unless its coverage is 0, or is 1 and it is no glass. Chance is a
+# hash of the ray's own bits, of the triangle and of Bvh.salt. So queries for closest and for any hit agree, triangles
+# along a ray are independent, and no ray needs a state. Needs ALPHA's arrays in scope, the ray's `start` and `way`, and
+# of Bvh `points`, `salt` and `chance`.
+TRANSPARENT = (
+    ALPHA
+    + """
+    if (chance == 2) return alpha < 1e-4f;
+    if (alpha <= 0.0f) return true;
+    float stops = alpha;
+    if (mask.through > 0.0f) {
+"""
+    + THROUGH
+    + """
+        stops *= 1.0f - through;
+    }
+    if (stops >= 1.0f) return false;
+    union { float number; unsigned bits; } words[6];
+    for (int axis = 0; axis < 3; ++axis) {
+        words[axis].number = start[axis];
+        words[3 + axis].number = way[axis];
+    }
+    unsigned long long hash = (unsigned long long)salt << 32 | (unsigned)face;
+    for (int pair = 0; pair < 3; ++pair) {
+        hash ^= hash >> 29;
+        hash = hash * 0xBF58476D1CE4E5B9ull + ((unsigned long long)words[pair].bits << 32 | words[3 + pair].bits);
+    }
+    hash = (hash ^ hash >> 30) * 0xBF58476D1CE4E5B9ull;  // splitmix64
+    hash = (hash ^ hash >> 27) * 0x94D049BB133111EBull;
+    return (float)(unsigned)(hash >> 40) * 0x1p-24f >= stops;
+"""
+)
 
 # Ray set-up, box test and triangle test, then the start of the query's struct. Rounding: boxes are enlarged when
 # they are filled in, the ray's far side moves out and its near side in by a bound on the error of
@@ -186,6 +241,10 @@ TRAVERSAL = (
         decltype(bvh.alphas.data) alphas;
         decltype(bvh.textures.data) textures;
         decltype(bvh.texels.data) texels;
+        decltype(bvh.points.data) points;
+        unsigned salt;
+        int chance;
+        float start[3], way[3];
 
         __attribute__((noinline, cold)) bool transparent(int face, float u, float v) const {%s}
         inline bool passes(int face, float u, float v) const {
@@ -204,7 +263,9 @@ TRAVERSAL = (
 QUERY = """
     const Query query = {
         (const char*)bvh.nodes.data, (const char*)bvh.blocks.data, bvh.face_masks.data, bvh.masks.data,
-        bvh.indices.data, bvh.uvs.data, bvh.alphas.data, bvh.textures.data, bvh.texels.data
+        bvh.indices.data, bvh.uvs.data, bvh.alphas.data, bvh.textures.data, bvh.texels.data,
+        bvh.points.data, bvh.salt, bvh.chance,
+        {origin[0], origin[1], origin[2]}, {direction[0], direction[1], direction[2]}
     };
     return query.run(origin[0], origin[1], origin[2], direction[0], direction[1], direction[2], t_max%s);
 """

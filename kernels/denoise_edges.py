@@ -10,8 +10,6 @@ the wall beside it, would light that wall up as the last picture moves by fracti
 
 import warp as wp
 
-from warp_gi.kernels.bsdf import average_specular
-from warp_gi.kernels.bvh import bvh_intersect
 from warp_gi.kernels.denoise import (
     LEAST_REFLECTANCE,
     Changes,
@@ -23,8 +21,9 @@ from warp_gi.kernels.denoise import (
 )
 from warp_gi.kernels.environment import environment_radiance
 from warp_gi.kernels.gbuffer import CameraData, camera_origin, camera_ray, tiled_pixel, view_distance
+from warp_gi.kernels.layers import layers_along
 from warp_gi.kernels.sampling import CAMERA_DIMENSION, circle, filter_offset, hash_uint, sample_1d, sample_2d
-from warp_gi.kernels.surface import Surface, shading_normal, surface_at, surface_emission
+from warp_gi.kernels.surface import Surface, shading_normal, surface_at
 from warp_gi.kernels.types import SceneData
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 4})  # compiles in less than two thirds, and is as fast
@@ -234,28 +233,31 @@ def with_sample(
 ) -> EdgeSums:
     r = sums
     direction = camera_ray(camera, at[0], at[1])
-    hit = bvh_intersect(scene.bvh, camera_origin(camera, at[0], at[1]), direction, float(wp.inf))
-    if hit.face < 0:
+    origin = camera_origin(camera, at[0], at[1])
+    seen = layers_along(scene, origin, direction)
+    if seen.face < 0:
         r.differ = r.differ or guides.guide_object[pixel] != 0
         r.shining += environment_radiance(scene.environment, direction)
         r.count += 1.0
         return r
-    s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
-    specular = average_specular(s.bsdf)
-    object = scene.geometry.objects[hit.face] + 1
+    s = surface_at(scene, seen.face, seen.u, seen.v, -direction)
+    object = scene.geometry.objects[seen.face] + 1
     elsewhere = is_elsewhere(settings, guides, pixel, object, s.position, shading_normal(s))
     own_color = guides.guide_diffuse[pixel] + guides.guide_specular[pixel]
-    r.differ = r.differ or elsewhere or colors_differ(own_color, s.bsdf.diffuse + specular)
+    r.differ = r.differ or elsewhere or colors_differ(own_color, seen.diffuse + seen.specular)
     known = SharedLight()
     if not elsewhere and settings.settles != 0:
-        known = own_light(light, pixel, s.bsdf.diffuse, specular)
+        known = own_light(light, pixel, seen.diffuse, seen.specular)
     if not known.seen:
-        known = shared_light(settings, guides, light, s, view_distance(camera, hit.t), at[0], at[1])
+        t = view_distance(camera, wp.length(s.position - origin))
+        known = shared_light(settings, guides, light, s, t, at[0], at[1])
     if known.seen:
-        r.reflected += wp.cw_mul(s.bsdf.diffuse, known.diffuse) + wp.cw_mul(glossy_scale(specular), known.glossy)
-        r.shining += surface_emission(scene, hit.face, hit.u, hit.v, -direction)
+        r.reflected += wp.cw_mul(seen.diffuse, known.diffuse) + wp.cw_mul(glossy_scale(seen.specular), known.glossy)
+        r.shining += seen.emission
+        if seen.left > 0.0:
+            r.shining += environment_radiance(scene.environment, direction) * seen.left
         r.count += 1.0
-        r.hits += 1.0
+        r.hits += 1.0 - seen.left
     return r
 
 

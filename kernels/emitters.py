@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_gi.kernels.bvh import is_masked, is_transparent
+from warp_gi.kernels.bvh import coverage, is_masked
 from warp_gi.kernels.sampling import triangle_barycentrics
 from warp_gi.kernels.surface import emitted_radiance
 from warp_gi.kernels.types import (
@@ -130,11 +130,13 @@ def sample_emitter(scene: SceneData, position: wp.vec3, choice: LightChoice, u: 
         material = scene.materials[scene.geometry.materials[light.triangle]]
         if material.double_sided == 0 and wp.dot(wp.cross(p1 - p0, p2 - p0), r.direction) >= 0.0:
             return r
+        covered = float(1.0)
         if is_masked(scene.bvh, light.triangle):  # no ray meets it where it has a hole
-            if is_transparent(scene.bvh, light.triangle, b[0], b[1]):
+            covered = coverage(scene.bvh, light.triangle, b[0], b[1])
+            if covered <= 0.0:
                 return r
         r.pdf = choice.pdf * triangle_light_pdf(scene, light.triangle, r.direction, r.distance)
-        r.radiance = emitted_radiance(scene, light.triangle, b[0], b[1])
+        r.radiance = emitted_radiance(scene, light.triangle, b[0], b[1]) * covered
         return r
     r = punctual_light(light, position)
     r.pdf = r.pdf * choice.pdf

@@ -73,6 +73,7 @@ class SurfaceBuffers:
     guide_normal: wp.array(dtype=wp.vec3)
     guide_plane: wp.array(dtype=wp.vec3)
     guide_object: wp.array(dtype=wp.int32)
+    guide_ratio: wp.array(dtype=wp.vec3)  # of this camera sample, see layers.py; empty without blended surfaces
 
 
 # Pixel of an item, in tiles; y may lie outside the picture.
@@ -168,17 +169,54 @@ def add_guides(
     motion: wp.vec2,
     object_id: wp.int32,
 ):
-    normal = shading_normal(s)
     buffers.guide_diffuse[pixel] = buffers.guide_diffuse[pixel] + s.bsdf.diffuse
     buffers.guide_specular[pixel] = buffers.guide_specular[pixel] + average_specular(s.bsdf)
+    keep_guides(buffers, pixel, s, distance, was, motion, object_id)
+
+
+# Sets the guides that are those of the first camera sample that hits.
+@wp.func
+def keep_guides(
+    buffers: SurfaceBuffers,
+    pixel: wp.int32,
+    s: Surface,
+    distance: wp.float32,
+    was: wp.vec3,
+    motion: wp.vec2,
+    object_id: wp.int32,
+):
     if buffers.guide_object[pixel] == 0:
         buffers.guide_distance[pixel] = distance
         buffers.guide_position[pixel] = s.position
         buffers.guide_previous[pixel] = was
         buffers.guide_motion[pixel] = motion
-        buffers.guide_normal[pixel] = normal
+        buffers.guide_normal[pixel] = shading_normal(s)
         buffers.guide_plane[pixel] = s.normal
         buffers.guide_object[pixel] = object_id + 1
+
+
+# Sets what is of the first camera sample alone; `face` is -1 where nothing is seen.
+@wp.func
+def keep_place(
+    scene: SceneData,
+    buffers: SurfaceBuffers,
+    settings: PassSettings,
+    pixel: wp.int32,
+    position: wp.vec3,
+    depth: wp.float32,
+    motion: wp.vec2,
+    face: wp.int32,
+):
+    if settings.camera_sample != 0:
+        return
+    buffers.position[pixel] = position
+    buffers.depth[pixel] = depth
+    buffers.motion[pixel] = motion
+    buffers.object_id[pixel] = -1
+    buffers.material_id[pixel] = -1
+    if face >= 0:
+        buffers.object_id[pixel] = scene.geometry.objects[face]
+        buffers.material_id[pixel] = scene.geometry.materials[face]
 
 
 # Thread: a pixel. Adds what the first hit shows: emission, coverage, albedo, normal; the first camera
@@ -202,8 +240,6 @@ def shade_primary(
     motion = project(previous_camera, direction) - project(camera, direction)
     position = wp.vec3(0.0, 0.0, 0.0)
     depth = float(wp.inf)
-    object_id = int(-1)
-    material_id = int(-1)
     if face < 0:
         buffers.emission[pixel] = buffers.emission[pixel] + environment_radiance(scene.environment, direction)
     else:
@@ -217,13 +253,7 @@ def shade_primary(
         motion = project(previous_camera, was - previous_camera.position) - project(camera, seen)
         position = s.position
         depth = wp.dot(position - camera.position, camera.forward)
-        object_id = scene.geometry.objects[face]
-        material_id = scene.geometry.materials[face]
         if buffers.guide_object.shape[0] > 0:
-            add_guides(buffers, pixel, s, view_distance(camera, hits.t[pixel]), was, motion, object_id)
-    if settings.camera_sample == 0:
-        buffers.position[pixel] = position
-        buffers.depth[pixel] = depth
-        buffers.object_id[pixel] = object_id
-        buffers.material_id[pixel] = material_id
-        buffers.motion[pixel] = motion
+            distance = view_distance(camera, hits.t[pixel])
+            add_guides(buffers, pixel, s, distance, was, motion, scene.geometry.objects[face])
+    keep_place(scene, buffers, settings, pixel, position, depth, motion, face)

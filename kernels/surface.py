@@ -2,7 +2,8 @@
 
 import warp as wp
 
-from warp_gi.kernels.bsdf import Bsdf, make_bsdf, make_coated_bsdf
+from warp_gi.kernels.bsdf import Bsdf, luminance, make_bsdf, make_coated_bsdf
+from warp_gi.kernels.bvh import transmitted
 from warp_gi.kernels.sampling import frame_of
 from warp_gi.kernels.types import WRAP_CLAMP, WRAP_MIRROR, WRAP_REPEAT, Geometry, Material, SceneData, Texture
 
@@ -136,7 +137,10 @@ def surface_emission(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.floa
         p0 = scene.geometry.points[ids[0]]
         if wp.dot(wp.cross(scene.geometry.points[ids[1]] - p0, scene.geometry.points[ids[2]] - p0), wo) <= 0.0:
             return wp.vec3(0.0, 0.0, 0.0)
-    return emitted_radiance(scene, face, u, v)
+    gain = float(1.0)
+    if scene.materials[scene.geometry.materials[face]].transmission > 0.0:
+        gain = 1.0 / wp.max(1.0 - transmitted(scene.bvh, face, u, v, wo)[0], 1.0e-4)
+    return emitted_radiance(scene, face, u, v) * gain
 
 
 # Distance by which a ray leaves the surface at `position`: above the rounding of positions
@@ -247,6 +251,23 @@ def coated_bsdf(
     return make_coated_bsdf(base, metallic, roughness, specular, reflectance)
 
 
+# The BSDF of glass, for the rays that chance does not let through. They stand for all that it reflects, so it is over
+# the probability that glass stops a ray along wo. This gain is on its Fresnel term F, of which the diffuse lobe takes
+# 1 - F. So that lobe is made up for what it loses at f0, where F is for nearly all pairs of directions that meet in a
+# diffuse lobe (bsdf.py).
+@wp.func
+def glass_bsdf(b: Bsdf, base: wp.vec3, through: wp.vec2) -> Bsdf:
+    r = b
+    gain = 1.0 / wp.max(1.0 - through[0], 1.0e-4)
+    transmission = wp.clamp(through[1] / wp.max(luminance(base), 1.0e-6), 0.0, 1.0)
+    f0 = luminance(b.f0)
+    made_up = (1.0 - f0) / wp.max(1.0 - wp.min(gain * f0, 1.0), 1.0e-3)
+    r.diffuse = b.diffuse * ((1.0 - transmission) * gain * made_up)
+    r.f0 = b.f0 * gain
+    r.f90 = b.f90 * gain
+    return r
+
+
 # Frame of shading at the point (u, v) of triangle `face` with coordinates uv, seen from direction wo.
 @wp.func
 def shading_frame(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32, uv: wp.vec2, wo: wp.vec3) -> wp.mat33:
@@ -310,9 +331,11 @@ def bare_surface(
     s.base_color = m.base_color
     if g.colors.shape[0] > 0:
         s.base_color = wp.cw_mul(s.base_color, vertex_color(scene, face, u, v))
-    if m.metallic > 0.0 or m.specular > 0.0:
+    if m.metallic > 0.0 or m.specular > 0.0 or m.transmission > 0.0:
         s = with_color(scene, s)
         s.bsdf = coated_bsdf(scene, m, s.base_color, face, u, v, s.uv)
+        if m.transmission > 0.0:
+            s.bsdf = glass_bsdf(s.bsdf, s.base_color, transmitted(scene.bvh, face, u, v, wo))
     else:
         s.bsdf = make_bsdf(s.base_color, 0.0, 1.0, 0.0)
     return s

@@ -48,7 +48,10 @@ class Material:
     reflectance: wp.vec3  # of the coat at normal incidence, before the factor; 0.04 is usual
     normal_scale: wp.float32
     emission: wp.vec3  # radiance
-    alpha_cutoff: wp.float32  # negative: opaque
+    alpha_cutoff: wp.float32  # negative: no mask
+    alpha_blend: wp.int32  # 1: alpha is the share of rays that it stops
+    transmission: wp.float32  # share of the light that is not reflected which goes straight through, tinted
+    transmission_texture: wp.int32  # R factor on transmission
     double_sided: wp.int32  # 1: emits on both sides (every surface reflects on both)
     base_color_texture: wp.int32  # RGB base colour, A coverage
     metallic_roughness_texture: wp.int32  # G roughness, B metallic
@@ -123,13 +126,17 @@ class Emitters:
     upper: wp.vec3
 
 
-# One way of cutting holes into triangles: a hit where the texture's bilinear
-# alpha times `factor` is below `cutoff` is passed through.
+# One way in which triangles let rays pass. Their coverage is the texture's alpha times `factor`, or 0 below `cutoff`
+# and 1 above it; rays pass by chance, with the probability 1 - coverage (1 - what glass lets through).
 @wp.struct
 class AlphaMask:
     texture: wp.int32  # in Bvh.textures; its alpha is 1 where there is none
     factor: wp.float32
-    cutoff: wp.float32
+    cutoff: wp.float32  # negative: none
+    through: wp.float32  # of glass: its transmission times the luminance of its tint; 0 is none
+    through_texture: wp.int32  # in Bvh.textures; its alpha is a factor on `through`
+    f0: wp.float32  # of glass: what it reflects at normal incidence and at grazing angles
+    f90: wp.float32
 
 
 # What a ray query needs; see bvh.py. The CPU reads nodes and blocks, CUDA reads mesh.
@@ -141,6 +148,9 @@ class Bvh:
     parents: wp.array(dtype=wp.int32)  # [block] the node above it
     face_masks: wp.array(dtype=wp.int32)  # [triangle] index in masks, -1 is opaque; empty where all are
     masks: wp.array(dtype=AlphaMask)
+    points: wp.array(dtype=wp.vec3)  # [vertex] for glass; empty without it
+    chance: wp.int32  # 1: some masks let rays pass by chance; 2: they do not now, for layers.py; 0: none does
+    salt: wp.uint32  # of chance; another one for each camera sample
     indices: wp.array(dtype=wp.vec3i)  # [triangle] for uvs; empty where all are opaque
     uvs: wp.array(dtype=wp.vec2)  # [vertex]
     alphas: wp.array(dtype=wp.float32)  # [vertex] coverage, multiplied with the texture's; empty if all are 1

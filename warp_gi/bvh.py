@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import mmap
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -23,16 +23,18 @@ MOST_TASKS = 1024
 ORDERED_RAYS = 1 << 15  # rays are ordered before they are traced if a batch has at least so many
 ORDERED_BYTES = 1 << 25  # and the tree has at least so many bytes
 HUGE_PAGE = 1 << 21  # bytes
+NO_GLASS = (0.0, -1, 0.0, 0.0)
 
 
 @dataclass(eq=False)
 class AlphaMasks:
-    """Holes cut by textures: a hit where bilinear alpha times factor is below the cutoff is passed through."""
+    """Triangles that let rays pass, where bilinear alpha times factor is below a cutoff, or by chance where it is below
+    1: with the probability 1 - alpha, which a hash of the ray decides (kernels/bvh_native.py)."""
 
     face_mask: np.ndarray
     """Index in ``masks`` of each triangle's mask, int32 [triangle]; -1 is opaque."""
-    masks: Sequence[tuple[int, float, float]]
-    """Masks as (index in ``textures``, or -1 for alpha 1; factor on alpha; cutoff)."""
+    masks: Sequence[tuple[int, float, float | None]]
+    """Masks as (index in ``textures``, or -1 for alpha 1; factor on alpha; cutoff, or None for chance)."""
     uvs: np.ndarray
     """Texture coordinates, float32 [vertex, 2], v up."""
     textures: wp.array
@@ -41,6 +43,9 @@ class AlphaMasks:
     """Texels of all textures, uint32 RGBA8 [texel] with red in the low byte, on the tree's device."""
     alphas: np.ndarray | None = None
     """Coverage of vertices, multiplied with that of textures, float32 [vertex]; None is 1."""
+    glass: Mapping[int, tuple[float, int, float, float]] = field(default_factory=dict)
+    """Masks, by their index, of surfaces that light goes straight through: (share of it, index of the texture whose
+    alpha is a factor on it or -1, reflectance at normal incidence, reflectance at grazing angles)."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         given = [getattr(self, one.name) for one in fields(self)]
@@ -196,9 +201,12 @@ class TriangleBvh:
         for i, (texture, factor, cutoff) in enumerate(alpha.masks):
             if not -1 <= texture < len(alpha.textures):
                 raise SceneError(f"alpha mask {i} names texture {texture}, but there are {len(alpha.textures)}")
-            masks[i] = (texture, factor, cutoff)
+            masks[i] = (texture, factor, -1.0 if cutoff is None else cutoff, *alpha.glass.get(i, NO_GLASS))
         self.data.face_masks = wp.array(face_mask, dtype=wp.int32, device=self.device)
         self.data.masks = wp.array(masks, dtype=types.AlphaMask, device=self.device)
+        self.data.chance = int(bool((masks["cutoff"] < 0.0).any() or alpha.glass))
+        if alpha.glass:
+            self.data.points = self._positions
         self.data.uvs = wp.array(uvs, dtype=wp.vec2, device=self.device)
         if alpha.alphas is not None:
             self.data.alphas = wp.array(np.asarray(alpha.alphas, np.float32), dtype=wp.float32, device=self.device)

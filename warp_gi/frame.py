@@ -15,6 +15,7 @@ import warp as wp
 from warp_gi import launch
 from warp_gi.errors import unknown_name
 from warp_gi.kernels import apart_lights, denoise, gbuffer, path_samplers, path_trace, types
+from warp_gi.layers import LobeShares, has_layers, solid_data
 from warp_gi.paths import PathRequest, sky_probability
 from warp_gi.scene.apart import ApartLights, apart_lights_of
 from warp_gi.scene.baked import BakedScene
@@ -45,6 +46,8 @@ BUFFERS = (
 )
 """Names of a frame's buffers: radiance in W/(m^2 sr), alpha the share of camera samples that hit, lengths in m, motion
 in pixels, ids -1 for "nothing"."""
+
+VIEW_SALT = 0x9E3779B9
 
 Offer = TypeVar("Offer")
 
@@ -103,6 +106,10 @@ class Frame:
         """The scene as camera rays see it: without its sky, if pictures have no background."""
         if not settings.background:
             self.seen_data.environment = types.Environment()
+        self.layer_data = solid_data(self.seen_data)
+        """``seen_data`` for kernels that walk through all layers of blended surfaces (``kernels.layers``)."""
+        self.lobe_shares: LobeShares | None = None
+        """What makes light that is divided by albedo fit such layers; None without any, or without a denoiser."""
         self.camera, self.previous_camera = camera, previous_camera
         self.index, self.previous_index = index, previous_index
         self.time = frame_time
@@ -145,6 +152,9 @@ class Frame:
         }
         if settings.wants_lobes:
             self._arrays |= {name: zeros(guide.type.dtype) for name, guide in denoise.Guides.vars.items()}
+            if has_layers(data):
+                self._arrays["guide_ratio"] = zeros(wp.vec3)
+                self.lobe_shares = LobeShares(self._arrays["guide_ratio"])
         self.hits = gbuffer.PrimaryHits()
         self.hits.direction = zeros(wp.vec3)
         for name in ("t", "u", "v"):
@@ -266,7 +276,17 @@ class Frame:
         kernel.sample_count = spp * (view + 1) // views - kernel.first_sample
         kernel.sample_bits = (spp - 1).bit_length()
         kernel.tent = int(self.settings.filter == "tent")
+        self.data.bvh.salt = (self.seed + view * VIEW_SALT) % 2**32  # of chance, by which rays pass through surfaces
         self.paths.begin()
+        lobes = self.lobes()
+        if self.lobe_shares is not None and lobes is not None:
+            self.lobe_shares.begin(lobes.diffuse, lobes.apart)
+
+    def end_view(self) -> None:
+        """End the camera sample: all light of it is there."""
+        lobes = self.lobes()
+        if self.lobe_shares is not None and lobes is not None:
+            self.lobe_shares.end(lobes.diffuse, lobes.apart)
 
     # ---- launches ----
 

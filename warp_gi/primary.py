@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from warp_gi.kernels import gbuffer
+from warp_gi.kernels import gbuffer, layers
+from warp_gi.layers import has_layers
+from warp_gi.scene.baked import whole_scene
 from warp_gi.stateful import Stateful
 
 if TYPE_CHECKING:
@@ -34,11 +36,13 @@ class CameraRays(Primary):
 
     def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
         """Return the kernel that shades hits."""
-        return (gbuffer.shade_primary,)
+        blends = scene is not None and any(one.has_chance for one in whole_scene(scene).materials)
+        return (layers.shade_layers if blends else gbuffer.shade_primary,)
 
     def trace(self, frame: Frame, state: Any) -> None:
         """Trace the rays and shade what they hit."""
         settings, cameras = frame.pass_settings, [frame.camera_data, frame.previous_camera_data]
         frame.launch_tiled(gbuffer.trace_primary, [frame.data, frame.camera_data, settings, frame.hits])
         buffers = frame.struct(gbuffer.SurfaceBuffers)
-        frame.launch(gbuffer.shade_primary, [frame.seen_data, *cameras, settings, frame.hits, buffers])
+        shade = layers.shade_layers if has_layers(frame.data) else gbuffer.shade_primary
+        frame.launch(shade, [frame.layer_data, *cameras, settings, frame.hits, buffers])

@@ -279,7 +279,7 @@ class FrameScheduler:
         now = frame_time(self.camera, index)
         self.scene.update(now, frame_time(self.camera, previous_index), self.device)
         data = launch.copied(self.scene.data(self.device), types.SceneData)
-        data.emitters = launch.copied(data.emitters, types.Emitters)
+        data.emitters, data.bvh = launch.copied(data.emitters, types.Emitters), launch.copied(data.bvh, types.Bvh)
         if self.scene.emitter_count:
             data.emitters.alias = whole_scene(self.scene).light_table(self.device)
         cameras = self._camera_at(index), self._camera_at(previous_index)
@@ -306,6 +306,7 @@ class FrameScheduler:
         with frame.stage("paths"):
             frame.paths.prepare()
             frame.trace_paths()
+            frame.end_view()
 
     def _camera_at(self, index: int) -> Camera:
         return self.camera.camera(index) if isinstance(self.camera, CameraPath) else self.camera

@@ -40,7 +40,7 @@ def peer_scene(
             if any(material.emission):
                 changes |= {"double_sided": False} if emission else {"emission": (0.0, 0.0, 0.0)}
             if not masks:
-                changes["alpha_cutoff"] = None
+                changes |= {"alpha_cutoff": None, "alpha_blend": False}
             materials[id(material)] = replace(material, **changes)
         return materials[id(material)]
 

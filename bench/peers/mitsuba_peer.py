@@ -285,9 +285,11 @@ def _bsdf(mi: Any, material: gi.Material) -> dict[str, Any]:
             "specular": float(material.specular),
         }
     image = material.base_color_texture
-    if material.alpha_cutoff is None:
+    if not material.lets_rays_pass:
         return bsdf
     alpha = None if image is None else image.pixels.astype(np.float32) / 255.0
+    if material.alpha_blend:
+        return {"type": "mask", "opacity": _number(mi, material.alpha, image, alpha, 3), "nested": bsdf}
     coverage = {
         "type": "coverage",
         "nested": _number(mi, material.alpha, image, alpha, 3),

@@ -389,7 +389,7 @@ def mesh_path(
     occluded[i] = queries.mesh_occluded(bvh, origins[i], directions[i], wp.inf)
 
 
-@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("masked", [False, True, "blended"])
 def test_the_cuda_path_agrees_with_the_cpu_path(masked):
     rng = np.random.default_rng(12)
     points, indices = soup(rng, 300)
@@ -397,6 +397,8 @@ def test_the_cuda_path_agrees_with_the_cpu_path(masked):
     indices[80:90] = indices[90:100]  # coincident, one of each pair masked
     indices[81:91:2] = indices[80:90:2]
     alpha = checker_masks(300, rng.uniform(-2, 3, (900, 2)).astype(np.float32)) if masked else None
+    if masked == "blended":
+        alpha.masks = [(0, 1.0, None)]
     tree = TriangleBvh(points, indices, alpha=alpha)
     origins, directions = rays(rng, 6000)
     mesh = bvh_module._make_mesh(wp.array(points, dtype=wp.vec3, device=CPU), indices, points)

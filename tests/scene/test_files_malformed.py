@@ -281,20 +281,19 @@ def test_rows_that_do_not_fit_their_header(body, message, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "alpha", "is_named"),
+    ("kind", "alpha", "expected"),
     [
-        ("uchar", "255", False),
-        ("uchar", "128", True),
-        ("float", "1", False),
-        ("float", "0.5", True),
-        ("float", "255", False),
+        ("uchar", "255", 1.0),
+        ("uchar", "51", 0.2),
+        ("float", "1", 1.0),
+        ("float", "0.5", 0.5),
+        ("float", "255", 1.0),
     ],
 )
-def test_constant_coverage_is_not_dropped_in_silence(kind, alpha, is_named, tmp_path):
+def test_alpha_of_vertex_colours_is_coverage(kind, alpha, expected, tmp_path):
     more = "".join(f"property {kind} {name}\n" for name in ("red", "green", "blue", "alpha"))
     body = "".join(f"{point} 1 0 0 {alpha}\n" for point in ("0 0 0", "1 0 0", "0 1 0")) + "3 0 1 2\n"
     (tmp_path / "a.ply").write_bytes(ply(more=more, body=body))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        gi.load_scene(tmp_path / "a.ply")
-    assert any("uses alpha of vertex colours" in str(one.message) for one in caught) == is_named
+    scene = gi.load_scene(tmp_path / "a.ply")
+    assert scene.materials[0].alpha_blend == (expected < 1.0)
+    np.testing.assert_allclose(scene.nodes[0].meshes[0].colors[:, 3], expected, rtol=1e-6)

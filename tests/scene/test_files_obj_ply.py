@@ -156,10 +156,35 @@ def test_wrong_lines_are_named(line, message, tmp_path):
 
 
 def test_meshlab_writes_tr_1_for_opaque(tmp_path):
-    assert material(tmp_path, "Kd 1 1 1\nTr 1.0\n").alpha_cutoff is None
+    assert not material(tmp_path, "Kd 1 1 1\nTr 1.0\n").lets_rays_pass
     assert material(tmp_path, "Kd 1 1 1\nTr 1.0\nd 0.25\n").alpha == 0.25
-    with pytest.warns(gi.UnsupportedWarning, match="coverage between 0 and 1"):
-        assert material(tmp_path, "Tr 0.75\n").alpha == 0.25
+
+
+@pytest.mark.parametrize("statement", ["Tr 0.75", "d 0.25", "d 0.25\nTr 0.75"])
+def test_coverage_between_0_and_1_is_blended(statement, tmp_path):
+    found = material(tmp_path, f"{statement}\n")
+    assert (found.alpha, found.alpha_blend, found.alpha_cutoff) == (0.25, True, None)
+
+
+@pytest.mark.parametrize("illum", [4, 6, 7, 9])
+def test_glass_of_mtl_is_a_pane(illum, tmp_path):
+    with pytest.warns(gi.UnsupportedWarning, match="glass of MTL"):
+        found = material(tmp_path, f"Kd 0 0 0\nd 0.1\nNi 1.52\nTf 0.5 0.75 1\nillum {illum}\n")
+    assert found.transmission == pytest.approx(0.9) and found.base_color == (0.5, 0.75, 1.0) and found.roughness == 0
+    assert found.reflectance == pytest.approx([(0.52 / 2.52) ** 2] * 3)
+    assert found.alpha == 1.0 and not found.alpha_blend
+
+
+@pytest.mark.parametrize(("middle", "factor", "blends"), [(0, 1, False), (1, 1, True), (0, 0.5, True)])
+def test_maps_of_holes_alone_are_cut_and_others_blended(middle, factor, blends, tmp_path):
+    """Whether a fifth of the texels are neither hole nor surface, or the map has a factor."""
+    from PIL import Image
+
+    levels = np.uint8([[0, 255, 128 if middle else 255, 255, 0]])
+    Image.fromarray(levels).save(tmp_path / "holes.png")
+    found = material(tmp_path, f"d {factor}\nmap_d holes.png\n")
+    assert found.alpha_blend == blends and found.alpha_cutoff == (None if blends else 0.5)
+    np.testing.assert_array_equal(found.base_color_texture.pixels[0, :, 3], levels[0])
 
 
 @pytest.mark.parametrize(

@@ -111,14 +111,14 @@ def test_meshes_far_from_their_own_origin_keep_their_digits():
 
 
 @pytest.mark.parametrize("kind", ["vertex_colors", "face_colors"])
-def test_coverage_of_colors_is_a_mask(kind):
+def test_coverage_of_colors_is_blended(kind):
     points, faces = [[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 1, 2]]
     count = 3 if kind == "vertex_colors" else 1
     clear = trimesh.Trimesh(points, faces, process=False, **{kind: [[255, 255, 255, 64]] * count})
-    with pytest.warns(gi.UnsupportedWarning, match=r"coverage between 0 and 1 \(colours of 'mesh'\)"):
-        scene = gi.load_scene(clear)
-    assert scene.materials[0].alpha_cutoff == 0.5
-    hit = scene.bvh("cpu").intersect(np.float32([[0.7, 0.2, 1]]), np.float32([[0, 0, -1]]))
-    assert hit.face.numpy()[0] == -1
+    scene = gi.load_scene(clear)
+    assert scene.materials[0].alpha_blend and scene.materials[0].alpha_cutoff is None
+    starts = np.float32(np.column_stack([np.linspace(0.6, 0.8, 4000), np.full(4000, 0.2), np.ones(4000)]))
+    stopped = (scene.bvh("cpu").intersect(starts, np.float32([[0, 0, -1]] * 4000)).face.numpy() == 0).mean()
+    assert abs(stopped - 64 / 255) < 4 * np.sqrt(0.25 * 0.75 / 4000)
     opaque = trimesh.Trimesh(points, faces, process=False, **{kind: [[255, 255, 255, 255]] * count})
-    assert gi.load_scene(opaque).materials[0].alpha_cutoff is None
+    assert not gi.load_scene(opaque).materials[0].lets_rays_pass

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -104,6 +105,26 @@ def test_unlit_is_seen_in_the_dark():
     for sky in (None, 1.0):
         beauty = picture(scene, sky=sky).numpy("beauty").reshape(-1, 3)
         np.testing.assert_allclose(beauty, np.tile([0.5, 0.25, 0.1], (768, 1)), rtol=1e-5)
+
+
+def test_glass_is_seen_through():
+    """A clear pane before a red wall: the mean over the layers, without a warning."""
+    path = CASES / "gltf-extensions-dropped" / "glass.glb"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = gi.load_scene(path)
+    assert (scene.materials[0].transmission, scene.materials[0].roughness) == (1.0, 0.0)
+    albedo = picture(scene).numpy("albedo").reshape(-1, 3)
+    np.testing.assert_allclose(albedo, np.tile([0.04 + 0.96 * 0.8, 0.04, 0.04], (768, 1)), atol=2e-3)
+
+
+def test_coloured_glass_is_named(tmp_path):
+    extension = {"transmissionFactor": 0.5}
+    glb = square({"pbrMetallicRoughness": {"baseColorFactor": [0.1, 1, 0.1, 1], "metallicFactor": 0}})
+    glb.json["materials"][0]["extensions"] = {"KHR_materials_transmission": extension}
+    with pytest.warns(gi.UnsupportedWarning, match="colours of glass"):
+        scene = gi.load_scene(glb.write(tmp_path / "g.glb"))
+    assert scene.materials[0].transmission == 0.5
 
 
 def test_unlit_with_colors_of_vertices(tmp_path):

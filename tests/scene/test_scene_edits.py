@@ -161,6 +161,7 @@ SHADING = {
     "emission": (put(paint, "emission", (1.0, 0.0, 0.0)), "emission of material 'paint'"),
     "normal_scale": (put(paint, "normal_scale", 0.5), "normal_scale of material 'paint'"),
     "alpha_cutoff": (put(paint, "alpha_cutoff", 0.5), "alpha_cutoff of material 'paint'"),
+    "alpha_blend": (put(paint, "alpha_blend", True), "alpha_blend of material 'paint'"),
     "double_sided": (put(glow, "double_sided", False), "double_sided of material 'glow'"),
     "no texture": (put(paint, "base_color_texture", None), "base_color_texture of material 'paint'"),
     "a texture more": (

@@ -94,7 +94,8 @@ def test_materials(rich):
     assert leaf.base_color_texture.srgb and not leaf.normal_texture.srgb
     assert leaf.normal_texture is leaf.metallic_roughness_texture
     assert leaf.normal_texture.pixels is leaf.base_color_texture.pixels
-    assert lamp.emission == (8.0, 4.0, 0.0) and lamp.alpha_cutoff == 0.5 and not lamp.double_sided
+    assert lamp.emission == (8.0, 4.0, 0.0) and lamp.alpha_cutoff is None and not lamp.double_sided
+    assert lamp.alpha_blend and not leaf.alpha_blend
     assert (lamp.metallic, lamp.roughness, lamp.base_color) == (1.0, 1.0, (1.0, 1.0, 1.0))
 
 

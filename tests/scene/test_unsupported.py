@@ -78,10 +78,6 @@ def points(glb):
     glb.json["meshes"][0]["primitives"].append({"attributes": {"POSITION": 0}, "mode": 0})
 
 
-def blend(glb):
-    glb.json["materials"][0]["alphaMode"] = "BLEND"
-
-
 def instances_of_a_skin(glb):
     attributes = glb.json["meshes"][0]["primitives"][0]["attributes"]
     attributes["JOINTS_0"], attributes["WEIGHTS_0"] = (
@@ -97,7 +93,6 @@ def instances_of_a_skin(glb):
 USES = {
     "COLOR_1": (attribute("COLOR_1", 3), r"COLOR_1 and above \(mesh 'tri'\)"),
     "points": (points, r"points and lines \(mesh 'tri'\)"),
-    "blend": (blend, r"alphaMode BLEND \(material 'm'\), which is approximated"),
     "instances": (instances_of_a_skin, r"instances of meshes with a skin \(node 'n'\)"),
 }
 

@@ -120,6 +120,10 @@ def _material_row(material: Material) -> tuple[object, ...]:
         "emission": material.emission_texture,
     }
     alpha = "opaque" if material.alpha_cutoff is None else f"mask {material.alpha_cutoff:g}"
+    if material.alpha_blend:
+        alpha = f"blend {material.alpha:g}"
+    if material.is_glass:
+        alpha += f", glass {material.transmission:g}"
     emission = _numbers(material.emission) if any(material.emission) else ""
     used = ", ".join(name for name, texture in textures.items() if texture is not None)
     return material.name, _numbers(material.base_color), material.metallic, material.roughness, emission, alpha, used

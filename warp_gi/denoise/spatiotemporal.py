@@ -246,7 +246,7 @@ class SpatioTemporal(Denoiser):
         if settings.settles == 0:
             edges.samples *= FIRST_EDGES
         if edges.samples > 0:
-            inputs = [frame.seen_data, frame.camera_data, settings, edges, guides, filtered, picture]
+            inputs = [frame.layer_data, frame.camera_data, settings, edges, guides, filtered, picture]
             frame.launch_tiled(denoise_edges.sample_edges, inputs)
         return self._averaged(frame, settings, edges, picture, last) if self.blend < 1 else None
 

@@ -27,7 +27,7 @@ class DeviceScene:
 
     def __init__(self, scene: SceneContents, device: wp.Device) -> None:
         from warp_gi.bvh import TriangleBvh
-        from warp_gi.scene.masks import alpha_masks
+        from warp_gi.scene.masks import alpha_masks, glass_tints
 
         self.scene, self.device = scene, device
         self.poses = self.previous_poses = scene._poses
@@ -40,7 +40,8 @@ class DeviceScene:
         self.emitters = emitters.emitter_table(scene._emissive, scene.lights, world)
         emitter_of = np.full(scene.triangle_count, -1, np.int32)
         emitter_of[scene._emissive] = np.arange(len(scene._emissive), dtype=np.int32)
-        images = textures.distinct_textures(scene.materials)
+        tints = glass_tints(scene.materials)
+        images = [*textures.distinct_textures(scene.materials), *tints.values()]
         texture_rows, texels = textures.texture_table(images)
 
         data = types.SceneData()
@@ -71,7 +72,7 @@ class DeviceScene:
         low, high = scene.bounds
         data.center = wp.vec3(*(float(x) for x in (low.astype(np.float64) + high) / 2.0))
         data.radius = scene.radius
-        masks = alpha_masks(flat, scene.materials, images, data.textures, data.texels)
+        masks = alpha_masks(flat, scene.materials, images, data.textures, data.texels, tints)
         self.bvh = TriangleBvh(flat.points, flat.indices, device=device.alias, alpha=masks)
         self._masks: AlphaMasks | None = masks
         self._static_bvh: TriangleBvh | None = None

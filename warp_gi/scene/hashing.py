@@ -21,18 +21,15 @@ def geometry_hash(scene: SceneContents) -> str:
     """Return the SHA-256 of all that decides visibility: triangles, alpha masks, animation."""
     digest = hashlib.sha256(b"warp_gi geometry 1")
     flat = scene._flat
-    masked = np.array([m.alpha_cutoff is not None for m in scene.materials])
+    masked = np.array([m.lets_rays_pass for m in scene.materials])
     _update(digest, flat.points, flat.indices)
     if masked.any():
         triangles = masked[flat.materials]
         _update(digest, triangles, flat.materials[triangles], flat.uvs[flat.indices[triangles]])
         if flat.colors is not None:
             _update(digest, flat.colors[flat.indices[triangles], 3])
-        for material in (m for m in scene.materials if m.alpha_cutoff is not None):
-            texture = material.base_color_texture
-            _update(digest, np.array([material.alpha, material.alpha_cutoff]))
-            if texture is not None:
-                _update(digest, repr((texture.wrap, texture.nearest)), texture.pixels[..., 3])
+        for material in (m for m in scene.materials if m.lets_rays_pass):
+            _update(digest, *textures.visibility_parts(material))
     for index, node in enumerate(scene.nodes):
         if scene._moving[index]:
             keys = [asdict(key) for key in node.keyframes or ()]

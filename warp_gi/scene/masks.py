@@ -1,45 +1,110 @@
-"""Triangles with holes, and the textures that cut them."""
+"""Triangles that let rays pass: with holes, blended, or of glass; and the textures that say where."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import warp as wp
 
 from warp_gi.bvh import AlphaMasks
+from warp_gi.color import LUMINANCE
 from warp_gi.scene.geometry import FlatGeometry
 from warp_gi.scene.model import Material, Texture
-from warp_gi.scene.textures import box_means
+from warp_gi.scene.textures import box_means, linear_rgb, texture_coordinates
 
 
 def alpha_masks(
-    flat: FlatGeometry, materials: Sequence[Material], images: Sequence[Texture], textures: wp.array, texels: wp.array
+    flat: FlatGeometry,
+    materials: Sequence[Material],
+    images: Sequence[Texture],
+    textures: wp.array,
+    texels: wp.array,
+    tints: Mapping[int, Texture],
 ) -> AlphaMasks | None:
     """Return the masks of the scene's materials, None if all triangles are opaque.
 
-    ``textures`` and ``texels`` hold ``images`` on the tree's device. A triangle of a masked
-    material over which no texel falls below the cutoff counts as opaque, which costs rays nothing.
+    ``textures`` and ``texels`` hold ``images`` on the tree's device. A triangle of a masked or blended
+    material over which no texel falls below the cutoff, or below 1, counts as opaque, which costs rays nothing.
+    ``tints`` are those of ``glass_tints``, which are among the images.
     """
     index_of = {id(image): index for index, image in enumerate(images)}
     face_mask = np.full(len(flat.indices), -1, np.int32)
-    masks: list[tuple[int, float, float]] = []
+    masks: list[tuple[int, float, float | None]] = []
+    glass: dict[int, tuple[float, int, float, float]] = {}
     alphas = None if flat.colors is None else np.ascontiguousarray(flat.colors[:, 3])
     for index, material in enumerate(materials):
-        if material.alpha_cutoff is None:
+        if not material.lets_rays_pass:
             continue
+        whole = 1.0 if material.alpha_cutoff is None else material.alpha_cutoff
         triangles = np.flatnonzero(flat.materials == index)
         texture = material.base_color_texture
         thinnest = 1.0  # coverage of the thinnest vertex; triangles with no hole for this reason are just slower
         if alphas is not None and len(triangles):
             thinnest = float(alphas[flat.indices[triangles]].min())
         if texture is None:
-            holed = triangles if material.alpha * thinnest < material.alpha_cutoff else triangles[:0]
+            holed = triangles if material.alpha * thinnest < whole else triangles[:0]
         else:
-            cut = texture.pixels[..., 3:] * (material.alpha * thinnest / 255.0) < material.alpha_cutoff
+            cut = texture.pixels[..., 3:] * (material.alpha * thinnest / 255.0) < whole
             uvs = flat.uvs[flat.indices[triangles]]
             holed = triangles[box_means(cut, texture.wrap, uvs.min(axis=1), uvs.max(axis=1))[:, 0] > 0.0]
+        if material.is_glass:
+            holed = triangles
+            tint = tints.get(index)
+            share = _brightest(material) * material.transmission * (1.0 - material.metallic)
+            glass[len(masks)] = share, -1 if tint is None else index_of[id(tint)], *_reflectance(material)
         if len(holed):
             face_mask[holed] = len(masks)
-            masks.append((-1 if texture is None else index_of[id(texture)], material.alpha, material.alpha_cutoff))
-    return AlphaMasks(face_mask, masks, flat.uvs, textures, texels, alphas) if masks else None
+            by_alpha = material.alpha_blend or material.alpha_cutoff is not None
+            coverage = texture if by_alpha else None
+            factor, cutoff = (material.alpha, material.alpha_cutoff) if by_alpha else (1.0, 0.0)
+            masks.append((-1 if coverage is None else index_of[id(coverage)], factor, cutoff))
+    return AlphaMasks(face_mask, masks, flat.uvs, textures, texels, alphas, glass) if masks else None
+
+
+def glass_tints(materials: Sequence[Material]) -> dict[int, Texture]:
+    """Return, by the material's index, what textures leave of the light that goes through glass.
+
+    It is the alpha of a texture at the base colour's coordinates, as large as the larger of the two that it is made of:
+    the luminance of the base colour over that of its factor, times the transmission.
+    """
+    found = {}
+    for index, material in enumerate(materials):
+        base, share = material.base_color_texture, material.transmission_texture
+        used = [one for one in (base, share) if one is not None]
+        if not material.is_glass or not used:
+            continue
+        height, width = (max(one.pixels.shape[axis] for one in used) for axis in (0, 1))
+        left = np.ones((height, width))
+        if base is not None:
+            colors = linear_rgb(base).astype(np.float64) * np.asarray(material.base_color)
+            left = _resampled(colors @ LUMINANCE / max(_brightest(material), 1e-12), base, height, width)
+        if share is not None:
+            left = left * _resampled(share.pixels[..., 0] / 255.0, share, height, width)
+        pixels = np.zeros((height, width, 4), np.uint8)
+        pixels[..., 3] = np.round(255.0 * np.clip(left, 0.0, 1.0))
+        nearest = any(one.nearest for one in used)
+        found[index] = Texture(f"tint of {material.name}", pixels, False, used[0].wrap, nearest)
+    return found
+
+
+def _resampled(values: np.ndarray, texture: Texture, height: int, width: int) -> np.ndarray:
+    """Return ``values`` of the texels of ``texture`` that are nearest to those of another size, [height, width]."""
+    u, v = np.meshgrid((np.arange(width) + 0.5) / width, 1.0 - (np.arange(height) + 0.5) / height)
+    uvs = texture_coordinates(replace(texture, uv_set=0), np.stack([u, v], axis=-1), None)
+    rows, columns = values.shape
+    row = np.floor((1.0 - uvs[..., 1]) % 1.0 * rows).astype(int).clip(0, rows - 1)
+    return values[row, np.floor(uvs[..., 0] % 1.0 * columns).astype(int).clip(0, columns - 1)]
+
+
+def _brightest(material: Material) -> float:
+    """Return the luminance of the base colour, without its texture."""
+    return float(np.asarray(material.base_color, np.float64) @ LUMINANCE)
+
+
+def _reflectance(material: Material) -> tuple[float, float]:
+    """Return the reflectance at normal incidence and at grazing angles, as make_coated_bsdf of kernels/bsdf.py."""
+    dielectric, metallic = 1.0 - material.metallic, material.metallic
+    f0 = float(np.minimum(material.reflectance, 1.0) @ LUMINANCE) * material.specular * dielectric
+    return f0 + _brightest(material) * metallic, material.specular * dielectric + metallic

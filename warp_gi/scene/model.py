@@ -69,9 +69,32 @@ class Material:
     normal_scale: float = 1.0
     """Factor on the x and y of the normal texture's normals."""
     alpha_cutoff: float | None = None
-    """Alpha below which a ray passes through the surface; None is opaque."""
+    """Alpha below which a ray passes through the surface; None is none."""
     double_sided: bool = True
     """Whether it emits on both sides. Every surface reflects and blocks light on both."""
+    alpha_blend: bool = False
+    """Whether alpha is the share of rays that the surface stops, as glTF's BLEND: each by chance, so that the mean is
+    right. Without it and without ``alpha_cutoff`` the surface is opaque."""
+    transmission: float = 0.0
+    """Share in [0, 1] of the light that is not reflected which goes straight through, as through a thin pane, times the
+    luminance of the base colour (KHR_materials_transmission); the rest meets the diffuse surface. Metal has none."""
+    transmission_texture: Texture | None = None
+    """Texture whose red is a factor on ``transmission``; linear."""
+
+    @property
+    def is_glass(self) -> bool:
+        """Whether light goes straight through it."""
+        return self.transmission > 0.0 and self.metallic < 1.0
+
+    @property
+    def has_chance(self) -> bool:
+        """Whether it lets some of the rays pass that meet one point of it."""
+        return self.alpha_blend or self.is_glass
+
+    @property
+    def lets_rays_pass(self) -> bool:
+        """Whether it lets any rays pass, by its alpha or by its transmission."""
+        return self.alpha_cutoff is not None or self.has_chance
 
 
 @dataclass(eq=False)

@@ -20,10 +20,21 @@ TEXTURE_SLOTS = (
     "emission_texture",
     "specular_texture",
     "reflectance_texture",
+    "transmission_texture",
 )
 
 
-NUMBERS = ("base_color", "alpha", "metallic", "roughness", "specular", "reflectance", "normal_scale", "emission")
+NUMBERS = (
+    "base_color",
+    "alpha",
+    "metallic",
+    "roughness",
+    "specular",
+    "reflectance",
+    "normal_scale",
+    "emission",
+    "transmission",
+)
 
 
 def check_texture(texture: Texture, owner: str) -> None:
@@ -59,13 +70,15 @@ def check_material(material: Material) -> None:
     for label, size in (("base_color", 3), ("emission", 3), ("reflectance", 3)):
         if np.shape(getattr(material, label)) != (size,):
             raise SceneError(f"{owner}: {label} must be {size} numbers, got {getattr(material, label)!r}")
-    for label in ("base_color", "alpha", "metallic", "roughness", "specular"):
+    for label in ("base_color", "alpha", "metallic", "roughness", "specular", "transmission"):
         within(label, getattr(material, label), 0.0, 1.0)
     within("emission", material.emission, 0.0, 1e30)
     within("reflectance", material.reflectance, 0.0, 1e6)
     within("normal_scale", material.normal_scale, -1e6, 1e6)
     if material.alpha_cutoff is not None:
         within("alpha_cutoff", material.alpha_cutoff, 0.0, np.inf)
+        if material.alpha_blend:
+            raise SceneError(f"{owner}: has an alpha_cutoff and alpha_blend, which are two readings of alpha; keep one")
     for slot in TEXTURE_SLOTS:
         texture = getattr(material, slot)
         if texture is not None:
@@ -117,12 +130,32 @@ def material_table(materials: Sequence[Material], textures: Sequence[Texture]) -
         for label in NUMBERS:
             row[label] = getattr(material, label)
         row["alpha_cutoff"] = -1.0 if material.alpha_cutoff is None else material.alpha_cutoff
+        row["alpha_blend"] = int(material.alpha_blend)
         row["double_sided"] = int(material.double_sided)
         row["colors_emit"] = int(material.colors_emit)
         for slot in TEXTURE_SLOTS:
             texture = getattr(material, slot)
             row[slot] = -1 if texture is None else index_of[id(texture)]
     return table
+
+
+def visibility_parts(material: Material) -> list[np.ndarray | str]:
+    """Return all of a material that decides which rays pass through its triangles, for a hash."""
+    texture = material.base_color_texture
+    by_alpha = material.alpha_blend or material.alpha_cutoff is not None
+    cutoff = -1.0 if material.alpha_cutoff is None else material.alpha_cutoff
+    parts: list[np.ndarray | str] = [np.array([material.alpha, cutoff])] if by_alpha else []
+    if by_alpha and texture is not None:
+        parts += [repr((texture.wrap, texture.nearest)), texture.pixels[..., 3]]
+    if material.is_glass:
+        numbers = [material.transmission, material.metallic, material.specular]
+        parts += ["glass", np.array([*numbers, *material.reflectance, *material.base_color])]
+        if texture is not None:
+            parts += [repr((texture.wrap, texture.nearest, texture.srgb)), texture.pixels]
+        share = material.transmission_texture
+        if share is not None:
+            parts += [repr((share.wrap, share.nearest, share.uv_set, share.transform)), share.pixels[..., 0]]
+    return parts
 
 
 def texture_coordinates(texture: Texture, uvs: np.ndarray, further_uvs: np.ndarray | None) -> np.ndarray:

@@ -92,9 +92,7 @@ class _Reader:
             material = self._material(visual.material, name)
         plain = Material(name, (0.8,) * 3 if colors is None else (1.0,) * 3, specular=0.0)
         if colors is not None and (colors[:, 3] < 1.0).any():
-            plain.alpha_cutoff = 0.5
-            if ((colors[:, 3] > 0.0) & (colors[:, 3] < 1.0)).any():
-                self.findings.add("coverage between 0 and 1", f"colours of {name!r}")
+            plain.alpha_blend = True
         if normals is not None and normals.shape != points.shape:
             normals = None
         return Mesh(
@@ -118,8 +116,6 @@ class _Reader:
         red, green, blue, alpha = _factors(source.baseColorFactor, 4)
         emission = _factors(source.emissiveFactor, 3, 0.0 if source.emissiveTexture is None else 1.0)
         mode = source.alphaMode or "OPAQUE"
-        if mode == "BLEND":
-            self.findings.add("alphaMode BLEND", f"material {name!r}")
         cutoff = 0.5 if source.alphaCutoff is None else float(source.alphaCutoff)
         textures = source.metallicRoughnessTexture
         return Material(
@@ -133,7 +129,8 @@ class _Reader:
             metallic_roughness_texture=self._texture(textures, False),
             normal_texture=self._texture(source.normalTexture, False),
             emission_texture=self._texture(source.emissiveTexture, True) if any(emission) else None,
-            alpha_cutoff={"OPAQUE": None, "MASK": cutoff}.get(mode, 0.5),
+            alpha_cutoff=cutoff if mode == "MASK" else None,
+            alpha_blend=mode == "BLEND",
             double_sided=source.doubleSided is not False,
         )
 

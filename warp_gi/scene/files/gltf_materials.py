@@ -10,13 +10,13 @@ import numpy as np
 
 from warp_gi.color import SRGB_TO_LINEAR, encode_srgb
 from warp_gi.errors import SceneError
+from warp_gi.scene.files.glass import has_colored_tint
 from warp_gi.scene.files.gltf_buffers import Buffers, decode_data_uri
 from warp_gi.scene.files.gltf_document import Document, Part
 from warp_gi.scene.files.images import find_file, read_image
 from warp_gi.scene.model import Color, Material, Texture
 
 WRAP_MODES = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
-BLEND_CUTOFF = 0.5
 NEAREST = 9728  # the one filter without interpolation between texels
 
 
@@ -64,8 +64,9 @@ class MaterialReader:
         surface = document.part(source, "pbrMetallicRoughness", what) or {}
         coat = document.extension(source, "KHR_materials_specular", what) or {}
         ior = document.extension(source, "KHR_materials_ior", what) or {}
+        through = document.extension(source, "KHR_materials_transmission", what) or {}
         normal = document.part(source, "normalTexture", what) or {}
-        coordinates = self._coordinates(old or {}, surface, source, coat, what)
+        coordinates = self._coordinates(old or {}, surface, source, coat, through, what)
         slot = _Slots(self, coordinates, what)
         strength = document.extension(source, "KHR_materials_emissive_strength", what) or {}
         red, green, blue, alpha = document.numbers(surface, "baseColorFactor", what, (1.0,) * 4)
@@ -92,8 +93,11 @@ class MaterialReader:
             emission_texture=slot.texture(source, "emissiveTexture", True) if any(emission) else None,
             specular_texture=slot.texture(coat, "specularTexture", False),
             reflectance_texture=slot.texture(coat, "specularColorTexture", True),
+            transmission=document.number(through, "transmissionFactor", what, 0.0),
+            transmission_texture=slot.texture(through, "transmissionTexture", False),
             normal_scale=document.number(normal, "scale", what, 1.0),
             alpha_cutoff=self._cutoff(source, what),
+            alpha_blend=source.get("alphaMode") == "BLEND",
             double_sided=bool(source.get("doubleSided")),
         )
         if old is not None:
@@ -110,13 +114,15 @@ class MaterialReader:
                 normal_texture=None,
                 colors_emit=True,
             )
+        if has_colored_tint(result):
+            document.findings.add("colours of glass", what)
         return result, coordinates
 
-    def _coordinates(self, old: Part, surface: Part, source: Part, coat: Part, what: str) -> Coordinates:
+    def _coordinates(self, old: Part, surface: Part, source: Part, coat: Part, through: Part, what: str) -> Coordinates:
         """Return the coordinates of the first texture of a material; note a third set."""
         places = [(old, "diffuseTexture"), (surface, "baseColorTexture"), (source, "emissiveTexture")]
         places += [(source, "normalTexture"), (surface, "metallicRoughnessTexture"), (old, "specularGlossinessTexture")]
-        places += [(coat, "specularTexture"), (coat, "specularColorTexture")]
+        places += [(coat, "specularTexture"), (coat, "specularColorTexture"), (through, "transmissionTexture")]
         infos = [self.document.part(holder, key, what) for holder, key in places]
         found = [texture_transform(self.document, info, what) for info in infos if info is not None]
         if not found:
@@ -165,9 +171,6 @@ class MaterialReader:
         mode = source.get("alphaMode", "OPAQUE")
         if mode not in ("OPAQUE", "MASK", "BLEND"):
             raise self.document.error(what, f"alphaMode must be OPAQUE, MASK or BLEND, got {mode!r:.60}")
-        if mode == "BLEND":
-            self.document.findings.add("alphaMode BLEND", what)
-            return BLEND_CUTOFF
         return self.document.number(source, "alphaCutoff", what, 0.5) if mode == "MASK" else None
 
     def texture(self, info: Part, srgb: bool, coordinates: Coordinates, what: str, material: str) -> Texture:

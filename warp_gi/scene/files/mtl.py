@@ -6,7 +6,7 @@ How MTL becomes glTF's metallic-roughness: ``Kd`` (times ``map_Kd``) is the base
 the reflectance at normal incidence, so the specular factor is max(Ks) / 0.04, at most 1, and Ks 0 is pure Lambert. It
 is the colour of a metal where a metal can be: there is no ``map_Kd``, every channel of Ks is above 0.25 and above Kd,
 Kd and Ks add up to 1 or less, and Kd is not coloured beside a grey Ks. ``Ke`` (times ``map_Ke``) is emitted radiance.
-``map_d``, or ``d``, or 1 - ``Tr``, is coverage, cut at 0.5; ``Tr 1`` without ``d`` is opaque, as its writers mean it.
+``map_d``, or ``d``, or 1 - ``Tr``, is coverage; ``Tr 1`` without ``d`` is opaque, as its writers mean it.
 ``norm`` is a normal map. Both sides emit. A colour of one number is grey.
 """
 
@@ -20,13 +20,13 @@ from pathlib import Path
 import numpy as np
 
 from warp_gi.errors import SceneError
+from warp_gi.scene.files.glass import GREY_STEP, has_colored_tint
 from warp_gi.scene.files.images import find_file, read_image
 from warp_gi.scene.files.support import Findings
 from warp_gi.scene.files.text import decode, joined, read_bytes, uncommented, without_comment
 from warp_gi.scene.model import Material, Texture
 
 METAL_SPECULAR = 0.25
-GREY_STEP = 0.02  # difference between channels below which a colour is grey
 OPTION_ARGUMENTS = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}
 """Number of arguments of MTL map options that take more or fewer than one."""
 MAP_FEATURES = {
@@ -41,11 +41,13 @@ MAP_FEATURES = {
     **dict.fromkeys(("map_ps", "map_pc", "map_pcr", "map_aniso"), "sheen, clear coats and anisotropy of MTL"),
 }
 NUMBER_FEATURES = dict.fromkeys(("ps", "pc", "aniso"), "sheen, clear coats and anisotropy of MTL")
-COLORS = ("kd", "ks", "ke")
-NUMBERS = {*COLORS, *NUMBER_FEATURES, "ns", "d", "tr", "pr", "pm", "illum"}
+COLORS = ("kd", "ks", "ke", "tf")
+HOLE = 24  # of 255, the alpha up to which a texel is one of a hole
+MOST_BETWEEN = 0.1  # share of texels that are neither hole nor surface in a map that is cut at 0.5
+NUMBERS = {*COLORS, *NUMBER_FEATURES, "ns", "ni", "d", "tr", "pr", "pm", "illum"}
 MAPS = ("map_kd", "map_d", "map_ke", "map_emissive", "norm", "map_pr", "map_pm")
 """Maps that are read, in the order in which their scale and offset count."""
-UNSEEN = {"ka", "map_ka", "ni", "sharpness", "map_aat", "pcr", "anisor"}
+UNSEEN = {"ka", "map_ka", "sharpness", "map_aat", "pcr", "anisor"}
 """Statements without a warning: ambient light is computed, and the others change no picture by themselves."""
 GLASS_MODELS = (4, 6, 7, 9)  # values of illum
 ELSEWHERE = re.compile(r"[A-Za-z]:[\\/]|\\\\|/|~")
@@ -77,7 +79,7 @@ class MtlMaterial:
                 self.unread.append(("statements of MTL without the numbers they need", f"{' '.join(words)!r}, {where}"))
             else:
                 self.numbers[key] = values
-        elif key not in UNSEEN and not (key == "tf" and all(_number(word) == 1.0 for word in uncommented(words)[1:])):
+        elif key not in UNSEEN:
             self.unread.append((f"{words[0]} of MTL", where))
 
 
@@ -130,6 +132,7 @@ class MtlReader:
         emission_map = maps.get("map_ke", maps.get("map_emissive"))
         emission = _color(numbers, "ke", 1.0 if emission_map else 0.0, highest=np.inf)
         coverage = _coverage(numbers)
+        is_cut = "map_d" in maps and coverage == 1.0 and color_map is not None and _is_cut_out(color_map.pixels[..., 3])
         shininess = max(_first(numbers, "ns", 0.0), 0.0)
         roughness, metallic = (2.0 / (shininess + 2.0)) ** 0.25, 0.0
         is_physical = any(key in numbers for key in ("pr", "pm")) or "map_pr" in maps or "map_pm" in maps
@@ -141,6 +144,8 @@ class MtlReader:
         elif "map_kd" not in maps and _is_metal(diffuse, specular):
             diffuse, metallic, factor = specular, 1.0, 1.0
         red, green, blue = diffuse.tolist()
+        if self._is_glass(source):
+            return self._glass(name, source), self._transform(name, source)
         material = Material(
             name,
             base_color=(red, green, blue),
@@ -155,10 +160,34 @@ class MtlReader:
             emission_texture=self._texture(name, source, "map_ke" if "map_ke" in maps else "map_emissive", srgb=True)
             if emission.max() > 0.0
             else None,
-            alpha_cutoff=0.5 if "map_d" in maps or coverage < 0.5 else None,
+            alpha_cutoff=0.5 if is_cut else None,
+            alpha_blend=not is_cut and ("map_d" in maps or coverage < 1.0),
             double_sided=True,
         )
         return material, self._transform(name, source)
+
+    def _is_glass(self, source: MtlMaterial) -> bool:
+        is_clear = "map_d" not in source.maps and _coverage(source.numbers) < 1.0
+        return is_clear and int(_first(source.numbers, "illum", 2.0)) in GLASS_MODELS
+
+    def _glass(self, name: str, source: MtlMaterial) -> Material:
+        """Return a pane that reflects as its index of refraction ``Ni`` says, tinted by ``Tf``."""
+        numbers = source.numbers
+        red, green, blue = _color(numbers, "tf", 1.0).tolist()
+        index = _first(numbers, "ni", 1.5)
+        reflectance = ((index - 1.0) / (index + 1.0)) ** 2 if index > 1.0 else 0.04
+        shininess = _first(numbers, "ns", np.inf)
+        result = Material(
+            name,
+            base_color=(red, green, blue),
+            roughness=float((2.0 / (max(shininess, 0.0) + 2.0)) ** 0.25),
+            reflectance=(reflectance,) * 3,
+            normal_texture=self._texture(name, source, "norm", srgb=False),
+            transmission=1.0 - _coverage(numbers),
+        )
+        if has_colored_tint(result):
+            self.findings.add("colours of glass", f"material {name!r}")
+        return result
 
     def _note(self, name: str, source: MtlMaterial) -> None:
         """Note statements that are not read in full."""
@@ -171,10 +200,10 @@ class MtlReader:
         for key, feature in NUMBER_FEATURES.items():
             if _first(source.numbers, key, 0.0) > 0.0:
                 self.findings.add(feature, what)
+        if min(_color(source.numbers, "tf", 1.0)) < 1.0 and not self._is_glass(source):
+            self.findings.add("Tf of MTL", what)
         if int(_first(source.numbers, "illum", 2.0)) in GLASS_MODELS:
             self.findings.add("glass of MTL (illum 4, 6, 7, 9)", what)
-        elif "map_d" not in source.maps and 0.0 < _coverage(source.numbers) < 1.0:
-            self.findings.add("coverage between 0 and 1", what)
 
     def _transform(self, name: str, source: MtlMaterial) -> np.ndarray | None:
         """Return ``-s`` and ``-o`` of the first map as [2, 3]; None for the identity."""
@@ -256,6 +285,11 @@ def _is_metal(diffuse: np.ndarray, specular: np.ndarray) -> bool:
     is_colored = np.ptp(diffuse) > GREY_STEP and np.ptp(specular) <= GREY_STEP
     is_bright = specular.min() > METAL_SPECULAR and np.all(specular > diffuse)
     return bool(is_bright and not is_colored and np.all(specular + diffuse <= 1.0 + 1e-6))
+
+
+def _is_cut_out(alpha: np.ndarray) -> bool:
+    """Return whether a map of coverage, uint8, says hole or surface nearly everywhere, as those of leaves do."""
+    return bool(np.mean((alpha > HOLE) & (alpha < 255 - HOLE)) < MOST_BETWEEN)
 
 
 def _coverage(numbers: dict[str, list[float]]) -> float:

@@ -297,12 +297,12 @@ def _mesh(
         corners, sizes = corners[np.repeat(~small, sizes)], sizes[~small]
     normals = vertices.columns(("nx", "ny", "nz"))
     uvs = next((one for one in map(vertices.columns, UV_NAMES) if one is not None), None)
-    colors = _colors(vertices, findings)
+    colors = _colors(vertices)
     grey = (0.8, 0.8, 0.8) if colors is None else (1.0, 1.0, 1.0)
     return Mesh(
         points,
         corners[triangulate(points, corners, sizes)[0]].astype(np.int32),
-        Material(path.stem, grey, specular=0.0),
+        Material(path.stem, grey, specular=0.0, alpha_blend=colors is not None and bool((colors[:, 3:] < 1.0).any())),
         None if normals is None else np.ascontiguousarray(normals, np.float32),
         None if uvs is None else np.ascontiguousarray(uvs, np.float32),
         path.stem,
@@ -310,9 +310,10 @@ def _mesh(
     )
 
 
-def _colors(vertices: Element, findings: Findings) -> np.ndarray | None:
-    """Return colours of vertices, linear; numbers in files are sRGB-coded, from 0 to the largest of their type.
+def _colors(vertices: Element) -> np.ndarray | None:
+    """Return colours of vertices, linear, with coverage where the file has alpha.
 
+    Numbers in files are sRGB-coded, except for alpha, from 0 to the largest of their type.
     Signed and 32-bit integers, and floats above 1, count from 0 to 255 where none is larger.
     """
     for names in COLOR_NAMES:
@@ -320,10 +321,12 @@ def _colors(vertices: Element, findings: Findings) -> np.ndarray | None:
         if colors is None or not len(colors):
             continue
         values = colors.astype(np.float64) / _largest(colors, vertices.kind(names[0]))
-        coverage = vertices.values.get("alpha")
-        if coverage is not None and (coverage < _largest(coverage, vertices.kind("alpha"))).any():
-            findings.add("alpha of vertex colours")
-        return decode_srgb(np.clip(np.nan_to_num(values), 0.0, 1.0)).astype(np.float32)
+        linear = decode_srgb(np.clip(np.nan_to_num(values), 0.0, 1.0)).astype(np.float32)
+        alpha = vertices.values.get("alpha")
+        if alpha is None:
+            return linear
+        covered = np.clip(np.nan_to_num(alpha / _largest(alpha, vertices.kind("alpha")), nan=1.0), 0.0, 1.0)
+        return np.column_stack([linear, covered.astype(np.float32)])
     return None
 
 

@@ -194,7 +194,7 @@ def _notes(scene: Scene, shown: Surfaces, rows: Rows) -> list[str]:
 def _with_images(scene: Scene, fixed: _Fixed, largest_mb: float) -> str:
     """Add materials, and images of base colour and emission; return how much smaller they are, or ""."""
     images = surfaces.images_of(scene.materials)
-    cut = {id(one.base_color_texture) for one in scene.materials if one.alpha_cutoff is not None}
+    cut = {id(one.base_color_texture) for one in scene.materials if one.lets_rays_pass}
     for step in (1, 2, 4, 8, 16):
         files = [surfaces.image_file(one, id(one) in cut, step) for one in images]
         if sum(map(len, files)) * 4 / 3 <= IMAGE_SHARE * largest_mb * 1e6:

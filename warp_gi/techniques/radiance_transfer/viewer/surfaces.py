@@ -14,6 +14,8 @@ from warp_gi.scene.scene import Scene
 from warp_gi.techniques.radiance_transfer.viewer.pages import faces_kept
 from warp_gi.techniques.shared.atlas.atlas import Atlas
 
+BLEND_CUTOFF = 0.5
+"""Alpha below which the page leaves holes in blended surfaces."""
 IMAGE_QUALITY = 88
 """Quality of embedded images, of 100; alpha is kept as it is."""
 SMALLEST_IMAGE = 64
@@ -82,7 +84,7 @@ def material_record(material: Material, images: Sequence[Texture]) -> dict[str, 
         "color": list(material.base_color),
         "image": number(material.base_color_texture),
         "alpha": material.alpha,
-        "cutoff": -1.0 if material.alpha_cutoff is None else material.alpha_cutoff,
+        "cutoff": BLEND_CUTOFF if material.alpha_blend else material.alpha_cutoff or -1.0,
         "emission": list(material.emission),
         "emissionImage": number(material.emission_texture) if max(material.emission) > 0 else -1,
         "doubleSided": material.double_sided,

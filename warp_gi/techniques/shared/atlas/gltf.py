@@ -229,7 +229,7 @@ class _Writer:
             roughnessFactor=float(source.roughness),
         )
         result = pygltflib.Material(name=source.name, pbrMetallicRoughness=surface, doubleSided=source.double_sided)
-        result.alphaMode = "OPAQUE" if source.alpha_cutoff is None else "MASK"
+        result.alphaMode = "BLEND" if source.alpha_blend else "OPAQUE" if source.alpha_cutoff is None else "MASK"
         result.alphaCutoff = None if source.alpha_cutoff is None else float(source.alpha_cutoff)
         strength = max(*source.emission, 1.0)
         result.emissiveFactor = [float(value) / strength for value in source.emission]

@@ -1,0 +1,154 @@
+"""Layers: all that a camera ray shows through blended surfaces and glass, of which ray queries draw one by chance.
+
+What a picture's readers and denoisers go by is the mean over the layers, so it has no noise: albedo, normals, coverage,
+emission. These kernels take a scene whose tree has `chance` 2: what lets rays pass by chance stops them all there.
+"""
+
+import warp as wp
+
+from warp_gi.kernels.bsdf import average_specular
+from warp_gi.kernels.bvh import bvh_intersect, coverage, is_masked, transmitted
+from warp_gi.kernels.environment import environment_radiance
+from warp_gi.kernels.gbuffer import (
+    CameraData,
+    PassSettings,
+    PrimaryHits,
+    SurfaceBuffers,
+    camera_origin,
+    keep_guides,
+    keep_place,
+    previous_position,
+    primary_sample,
+    project,
+    view_distance,
+)
+from warp_gi.kernels.surface import shading_normal, surface_at, surface_emission
+from warp_gi.kernels.types import SceneData
+
+wp.set_module_options({"enable_backward": False})
+
+MOST_LAYERS = wp.constant(64)
+LEAST_LEFT = wp.constant(wp.float32(1.0e-4))  # share of a ray that is not followed further
+
+
+# Sums over the layers of a ray, each times its share of the ray; and the layer with the largest share.
+@wp.struct
+class Layers:
+    left: wp.float32  # share that meets nothing
+    diffuse: wp.vec3
+    specular: wp.vec3
+    albedo: wp.vec3
+    normal: wp.vec3
+    emission: wp.vec3  # without the sky
+    share: wp.float32  # the largest
+    face: wp.int32  # -1: the ray meets nothing at all
+    u: wp.float32
+    v: wp.float32
+
+
+@wp.func
+def layers_along(scene: SceneData, start: wp.vec3, direction: wp.vec3) -> Layers:
+    r = Layers()
+    r.left = 1.0
+    r.face = -1
+    origin = start
+    count = int(0)
+    while r.left > 0.0 and count < MOST_LAYERS:
+        hit = bvh_intersect(scene.bvh, origin, direction, float(wp.inf))
+        if hit.face < 0:
+            break
+        s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
+        share = r.left
+        if scene.bvh.chance != 0 and is_masked(scene.bvh, hit.face):
+            stops = 1.0 - transmitted(scene.bvh, hit.face, hit.u, hit.v, direction)[0]
+            share = r.left * stops * coverage(scene.bvh, hit.face, hit.u, hit.v)
+            if r.left - share < LEAST_LEFT:
+                share = r.left
+        r.left = r.left - share
+        r.diffuse = r.diffuse + s.bsdf.diffuse * share
+        r.specular = r.specular + average_specular(s.bsdf) * share
+        r.albedo = r.albedo + s.base_color * share
+        r.normal = r.normal + shading_normal(s) * share
+        r.emission = r.emission + surface_emission(scene, hit.face, hit.u, hit.v, -direction) * share
+        if share > r.share:
+            r.share = share
+            r.face = hit.face
+            r.u = hit.u
+            r.v = hit.v
+        origin = s.position - s.normal * s.offset
+        count += 1
+    return r
+
+
+# What the diffuse light of a drawn surface is multiplied with, so that times the mean albedo it is what was reflected.
+@wp.func
+def albedo_ratio(drawn: wp.vec3, mean: wp.vec3) -> wp.vec3:
+    r = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(3):
+        if mean[k] > 0.0:
+            r[k] = drawn[k] / mean[k]
+    return r
+
+
+# Thread: a pixel. As gbuffer.shade_primary, for means over layers; what is of one surface is that of the layer with the
+# largest share. `ratios`, where wanted, is what the denoiser's diffuse light of this camera sample is multiplied with.
+@wp.kernel
+def shade_layers(
+    first: wp.int32,
+    scene: SceneData,
+    camera: CameraData,
+    previous_camera: CameraData,
+    settings: PassSettings,
+    hits: PrimaryHits,
+    buffers: SurfaceBuffers,
+):
+    pixel = first + wp.tid()
+    direction = hits.direction[pixel]
+    at = primary_sample(settings, wp.vec2i(pixel % camera.width, pixel / camera.width))
+    origin = camera_origin(camera, at[0], at[1])
+    r = layers_along(scene, origin, direction)
+    sky = environment_radiance(scene.environment, direction)
+    buffers.emission[pixel] = buffers.emission[pixel] + r.emission + sky * r.left
+    buffers.alpha[pixel] = buffers.alpha[pixel] + 1.0 - r.left
+    buffers.albedo[pixel] = buffers.albedo[pixel] + r.albedo
+    buffers.normal[pixel] = buffers.normal[pixel] + r.normal
+    motion = project(previous_camera, direction) - project(camera, direction)
+    if r.face < 0:
+        keep_place(scene, buffers, settings, pixel, wp.vec3(0.0, 0.0, 0.0), float(wp.inf), motion, -1)
+        return
+    s = surface_at(scene, r.face, r.u, r.v, -direction)
+    was = previous_position(scene.geometry, r.face, r.u, r.v)
+    seen = wp.where(camera.spread > 0.0, direction, s.position - camera.position)
+    motion = project(previous_camera, was - previous_camera.position) - project(camera, seen)
+    depth = wp.dot(s.position - camera.position, camera.forward)
+    keep_place(scene, buffers, settings, pixel, s.position, depth, motion, r.face)
+    if buffers.guide_object.shape[0] == 0:
+        return
+    buffers.guide_diffuse[pixel] = buffers.guide_diffuse[pixel] + r.diffuse
+    buffers.guide_specular[pixel] = buffers.guide_specular[pixel] + r.specular
+    distance = view_distance(camera, wp.length(s.position - origin))
+    keep_guides(buffers, pixel, s, distance, was, motion, scene.geometry.objects[r.face])
+    if hits.face[pixel] >= 0:
+        drawn = surface_at(scene, hits.face[pixel], hits.u[pixel], hits.v[pixel], -direction)
+        buffers.guide_ratio[pixel] = albedo_ratio(drawn.bsdf.diffuse, r.diffuse)
+
+
+# Light that a denoiser divides by albedo, [height * width]: before this camera sample, and with it. Empty: not wanted.
+@wp.struct
+class LobeSums:
+    ratio: wp.array(dtype=wp.vec3)
+    diffuse_before: wp.array(dtype=wp.vec3)
+    diffuse: wp.array(dtype=wp.vec3)
+    apart_before: wp.array(dtype=wp.vec3)
+    apart: wp.array(dtype=wp.vec3)
+
+
+# Thread: a pixel. Makes what a camera sample added the light of the layers' mean albedo.
+@wp.kernel
+def share_lobes(first: wp.int32, sums: LobeSums):
+    i = first + wp.tid()
+    before = sums.diffuse_before[i]
+    sums.diffuse[i] = before + wp.cw_mul(sums.diffuse[i] - before, sums.ratio[i])
+    if sums.apart.shape[0] > 0:
+        was = sums.apart_before[i]
+        sums.apart[i] = was + wp.cw_mul(sums.apart[i] - was, sums.ratio[i])

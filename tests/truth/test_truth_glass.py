@@ -1,0 +1,102 @@
+"""Thin glass: straight through by chance, what it reflects and lets through adds up, and windows let the sky in."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import statistics_tools as st
+from scene_tools import quad
+from statistics_tools import every_device  # noqa: F401
+from test_truth_blend import box, pane
+from truth_tools import ALBEDO, ground, scene_of, spot_camera
+
+import warp_gi as gi
+
+SKY = np.array([2.0, 3.0, 4.0])
+PATH = gi.Pipeline(spp=16, camera_samples=16)
+
+
+def glass(color=(1.0, 1.0, 1.0), transmission=1.0, **fields):
+    return gi.Material("glass", color, transmission=transmission, roughness=0.0, **fields)
+
+
+def schlick(cosine, f0=0.04, f90=1.0):
+    return f0 + (f90 - f0) * (1.0 - cosine) ** 5
+
+
+def seen_through(angle, material, spp=PATH, count=24):
+    """Pictures of the sky through a pane, from an angle [degrees] to its normal."""
+    eye = 3.0 * np.array([np.sin(np.radians(angle)), 0.0, np.cos(np.radians(angle))])
+    camera = gi.Camera.look_at(eye + np.array([0, 0.013, 0]), (0, 0.013, 0), hfov=0.2, resolution=(8, 8))
+    return st.renderings(scene_of(pane(0.0, material, 30.0), environment=tuple(SKY)), camera, spp, count)
+
+
+@pytest.mark.parametrize("angle", [0.0, 45.0, 80.0, 87.0])
+def test_clear_glass_is_a_white_furnace(angle):
+    st.assert_mean(seen_through(angle, glass()), SKY, tolerance=2e-3)
+
+
+@pytest.mark.parametrize("angle", [0.0, 60.0, 84.0])
+def test_tinted_glass_lets_its_share_through_and_reflects_as_fresnel_says(angle):
+    """Grey of 0.5, 0.8 of it glass, over a matt surface of the same grey, all under one sky."""
+    fresnel = schlick(np.cos(np.radians(angle)))
+    expected = SKY * (fresnel + (1 - fresnel) * 0.8 * 0.5)
+    images = seen_through(angle, glass((0.5, 0.5, 0.5), 0.8), count=40)
+    matt = replace(glass((0.5, 0.5, 0.5), 0.0), specular=0.0)
+    share = (seen_through(angle, matt, count=4) / SKY).mean()  # 0.5
+    diffuse = SKY * 0.2 * share * (1 - schlick(1.0))
+    st.assert_mean(images, expected + diffuse, tolerance=0.03 if angle > 70 else 0.01)
+
+
+@pytest.mark.parametrize("angle", [0.0, 70.0, 85.0])
+def test_the_sun_through_a_pane_loses_what_the_angle_reflects(angle):
+    way = -np.array([np.sin(np.radians(angle)), np.cos(np.radians(angle)), 0.0])
+    sun = gi.PunctualLight("directional", (3.0, 2.0, 1.0), direction=tuple(way))
+    above = quad((-40, 1, 3), (80, 0, 0), (0, 0, -6), glass((0.6, 0.6, 0.6), 0.9), "pane")
+    camera = gi.Camera.look_at((0.02, 0.5, 0.03), (0, 0, 0), up=(0, 0, 1), hfov=0.1, resolution=(4, 4))
+    pipeline = gi.Pipeline(spp=1, camera_samples=1, environment=None)
+    images = st.renderings(scene_of(ground(size=0.5), above, lights=[sun]), camera, pipeline, 300, "emitters")
+    through = 0.9 * 0.6 * (1 - schlick(np.cos(np.radians(angle))))
+    light = np.array([3.0, 2.0, 1.0]) * np.cos(np.radians(angle))
+    st.assert_mean(images, ALBEDO / np.pi * light * through, tolerance=1e-3)
+
+
+def test_a_closed_box_with_a_window_is_lit_by_the_sky():
+    """A black box with one side of glass above a small ground: form factors with Fresnel's loss, in float64."""
+    black = gi.Material("black", (0.0, 0.0, 0.0), specular=0.0)
+    sides = box(black)
+    window = [replace(one, material=glass((0.8, 0.8, 0.8))) if one.name == "side 1 1.0" else one for one in sides]
+    assert sum(one.material.name == "glass" for one in window) == 1
+    n = 400
+    at = (np.arange(n) + 0.5) / n * 2.0 - 1.0
+    x, z = np.meshgrid(at, at)
+    cosine = 1.0 / np.sqrt(1.0 + x * x + z * z)
+    form = (cosine**4 / np.pi * 0.8 * (1.0 - schlick(cosine))).sum() * (2.0 / n) ** 2
+    view = gi.Camera.look_at((0.1, 0.4, 0.05), (0.0, 0.0, 0.0), up=(0, 0, 1), hfov=0.1, resolution=(4, 4))
+    scene = scene_of(ground(size=0.02), *window, environment=tuple(SKY))
+    st.assert_mean(st.renderings(scene, view, PATH, 80, "environment"), ALBEDO * SKY * form, tolerance=2e-3)
+
+
+def test_textures_of_transmission_and_tint():
+    """Left half clear, right half opaque; a base colour texture dims by its luminance."""
+    share = gi.Texture("t", np.uint8([[[255, 0, 0, 255], [0, 0, 0, 255]]]), False, ("clamp", "clamp"), nearest=True)
+    tint = gi.Texture("c", np.uint8([[[128, 128, 128, 255]]]), srgb=False)
+    card = quad((-1, -1, 0), (2, 0, 0), (0, 2, 0), glass(transmission_texture=share, specular=0.0), "card")
+    scene = scene_of(card, environment=tuple(SKY))
+    rays = np.float32([[-0.5, 0.1, 1.0]] * 100 + [[0.5, 0.1, 1.0]] * 100) + np.linspace(0, 0.01, 200)[:, None]
+    face = scene.bvh("cpu").intersect(np.float32(rays), np.float32([[0, 0, -1]] * 200)).face.numpy()
+    assert (face[:100] == -1).all() and (face[100:] >= 0).all()
+    tinted = replace(card, material=glass(transmission_texture=share, base_color_texture=tint, specular=0.0))
+    rays = np.random.default_rng(3).uniform([-0.9, -0.9, 1], [-0.1, 0.9, 1.001], (20000, 3)).astype(np.float32)
+    bvh = scene_of(tinted).bvh("cpu")
+    stopped = (bvh.intersect(rays, np.float32([[0, 0, -1]] * 20000)).face.numpy() >= 0).mean()
+    assert abs(stopped - (1 - 128 / 255)) < 0.015
+
+
+def test_guides_show_what_is_behind_a_window():
+    red = gi.Material("red", (0.8, 0.0, 0.0), specular=0.0)
+    scene = scene_of(pane(0.0, glass()), pane(-1.0, red), environment=(1, 1, 1))
+    frame = next(gi.render(scene, spot_camera((0.013, 0.007, 1.0), 4), gi.Pipeline(spp=1), device=str(st.device())))
+    assert np.allclose(frame.numpy("albedo"), 0.04 * np.ones(3) + 0.96 * np.array([0.8, 0, 0]), atol=2e-3)
+    assert (frame.numpy("object_id") == 0).all() and np.allclose(frame.numpy("depth"), 3.0, atol=1e-2)
+    assert scene.geometry_hash != scene_of(pane(0.0, glass((0.5, 0.5, 0.5))), pane(-1.0, red)).geometry_hash
