@@ -11,6 +11,7 @@ from warp_gi.scene.geometry import FlatGeometry
 from warp_gi.scene.model import Material, Node, PunctualLight
 
 if TYPE_CHECKING:
+    from warp_gi.scene.emission_grids import LightGrids
     from warp_gi.scene.environment import Environment
 
 
@@ -25,6 +26,8 @@ class SceneContents(Protocol):
     """Copy of the geometry of all nodes at time 0, in world space."""
     _emissive: np.ndarray
     """Indices of the triangles that emit, int64 [emissive triangle]."""
+    _light_grids: LightGrids
+    """How points on them are sampled."""
     _moving: list[bool]
     """Whether each node moves, by its index."""
     _world: list[np.ndarray]
