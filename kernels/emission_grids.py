@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_gi.kernels.alias import LARGEST_FLOAT_BELOW_ONE, alias_choice_of
 from warp_gi.kernels.sampling import triangle_barycentrics
-from warp_gi.kernels.types import SceneData
+from warp_gi.kernels.types import AliasBucket, EmissionGrid, SceneData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -23,14 +23,9 @@ class EmitterPoint:
     density: wp.float32  # of sampling it, over that of points uniform on the triangle
 
 
-# Density of `emitter_point` at the point (u, v) of the triangle of an emitter.
-@wp.func
-def emitter_point_density(scene: SceneData, emitter: wp.int32, u: wp.float32, v: wp.float32) -> wp.float32:
-    if scene.emitters.grids.shape[0] == 0:
-        return 1.0
-    grid = scene.emitters.grids[emitter]
-    if grid.side == 0:
-        return 1.0
+# Density of `grid_point` at the point (u, v) of its triangle. Both are calls of their own, as few paths come by them.
+@wp.func(inline=False)
+def grid_density(densities: wp.array(dtype=wp.vec4), grid: EmissionGrid, u: wp.float32, v: wp.float32) -> wp.float32:
     x = wp.clamp(u, 0.0, 1.0) * wp.float32(grid.side)
     y = wp.clamp(v, 0.0, 1.0) * wp.float32(grid.side)
     i = wp.min(wp.int32(x), grid.side - 1)
@@ -42,8 +37,18 @@ def emitter_point_density(scene: SceneData, emitter: wp.int32, u: wp.float32, v:
         b = 1.0 - b
         i = grid.side - 1 - i
         j = grid.side - 1 - j
-    w = scene.emitters.densities[grid.start + j * grid.side + i]
+    w = densities[grid.start + j * grid.side + i]
     return w[0] * wp.max(1.0 - a - b, 0.0) + w[1] * a + w[2] * b + w[3]
+
+
+# Density of `emitter_point` at the point (u, v) of the triangle of an emitter.
+@wp.func
+def emitter_point_density(scene: SceneData, emitter: wp.int32, u: wp.float32, v: wp.float32) -> wp.float32:
+    if scene.emitters.grids.shape[0] > 0:
+        grid = scene.emitters.grids[emitter]
+        if grid.side > 0:
+            return grid_density(scene.emitters.densities, grid, u, v)
+    return 1.0
 
 
 # A point of a cell (barycentric weights in it) whose density is `w`: one of its four parts by its mass, then a point of
@@ -71,27 +76,37 @@ def cell_point(w: wp.vec4, u: wp.float32, v: wp.float32) -> wp.vec2:
     return wp.vec2(rest * v, x)
 
 
-# A point on the triangle of an emitter. A float32 holds too few digits for a cell and a point in it, so the last digits
-# of u[1] follow those of u[0].
+# A point on a triangle with a grid. A float32 holds too few digits for a cell and a point in it, so the last digits of
+# u[1] follow those of u[0].
+@wp.func(inline=False)
+def grid_point(
+    cells: wp.array(dtype=AliasBucket), densities: wp.array(dtype=wp.vec4), grid: EmissionGrid, u: wp.vec2
+) -> EmitterPoint:
+    r = EmitterPoint()
+    digits = u[1] * 4096.0
+    digits = digits - wp.floor(digits)
+    drawn = alias_choice_of(cells, grid.start, grid.side * grid.side, u[0], digits)
+    w = densities[grid.start + drawn.item]
+    p = cell_point(w, drawn.remainder, wp.min(u[1], LARGEST_FLOAT_BELOW_ONE))
+    r.density = w[0] * wp.max(1.0 - p[0] - p[1], 0.0) + w[1] * p[0] + w[2] * p[1] + w[3]
+    i = drawn.item % grid.side
+    j = drawn.item / grid.side
+    if i + j >= grid.side:
+        i = grid.side - i
+        j = grid.side - j
+        p = -p
+    r.b = (wp.vec2(wp.float32(i), wp.float32(j)) + p) / wp.float32(grid.side)
+    return r
+
+
+# A point on the triangle of an emitter.
 @wp.func
 def emitter_point(scene: SceneData, emitter: wp.int32, u: wp.vec2) -> EmitterPoint:
-    r = EmitterPoint()
-    r.b = triangle_barycentrics(u)
-    r.density = 1.0
     if scene.emitters.grids.shape[0] > 0:
         grid = scene.emitters.grids[emitter]
         if grid.side > 0:
-            digits = u[1] * 4096.0
-            digits = digits - wp.floor(digits)
-            drawn = alias_choice_of(scene.emitters.cells, grid.start, grid.side * grid.side, u[0], digits)
-            w = scene.emitters.densities[grid.start + drawn.item]
-            p = cell_point(w, drawn.remainder, wp.min(u[1], LARGEST_FLOAT_BELOW_ONE))
-            r.density = w[0] * wp.max(1.0 - p[0] - p[1], 0.0) + w[1] * p[0] + w[2] * p[1] + w[3]
-            i = drawn.item % grid.side
-            j = drawn.item / grid.side
-            if i + j >= grid.side:
-                i = grid.side - i
-                j = grid.side - j
-                p = -p
-            r.b = (wp.vec2(wp.float32(i), wp.float32(j)) + p) / wp.float32(grid.side)
+            return grid_point(scene.emitters.cells, scene.emitters.densities, grid, u)
+    r = EmitterPoint()
+    r.b = triangle_barycentrics(u)
+    r.density = 1.0
     return r
