@@ -26,13 +26,16 @@ def alias_position(count: wp.int32, u: wp.float32, v: wp.float32) -> wp.float64:
     return (wp.float64(u) + wp.float64(v) * wp.float64(5.9604644775390625e-8)) * wp.float64(count)
 
 
-# An item from two uniform numbers in [0, 1): u decides, as stratified as it is, and v adds digits (alias_position).
+# An item of a table that has `count` buckets of many from number `start` on, from two uniform numbers in [0, 1): u
+# decides, as stratified as it is, and v adds digits (alias_position).
 @wp.func
-def alias_choice(buckets: wp.array(dtype=AliasBucket), count: wp.int32, u: wp.float32, v: wp.float32) -> AliasChoice:
+def alias_choice_of(
+    buckets: wp.array(dtype=AliasBucket), start: wp.int32, count: wp.int32, u: wp.float32, v: wp.float32
+) -> AliasChoice:
     position = alias_position(count, u, v)
     item = wp.min(wp.int32(position), count - 1)
     rest = wp.min(wp.float32(position - wp.float64(item)), LARGEST_FLOAT_BELOW_ONE)
-    bucket = buckets[item]
+    bucket = buckets[start + item]
     keep = bucket.probability
     choice = AliasChoice()
     if rest < keep:
@@ -45,6 +48,12 @@ def alias_choice(buckets: wp.array(dtype=AliasBucket), count: wp.int32, u: wp.fl
         choice.remainder = (rest - keep) / (1.0 - keep)
     choice.remainder = wp.min(choice.remainder, LARGEST_FLOAT_BELOW_ONE)
     return choice
+
+
+# An item of a table by itself.
+@wp.func
+def alias_choice(buckets: wp.array(dtype=AliasBucket), count: wp.int32, u: wp.float32, v: wp.float32) -> AliasChoice:
+    return alias_choice_of(buckets, 0, count, u, v)
 
 
 # Starts fetching the bucket that alias_choice will read for u (or, in tables of millions, its neighbour).

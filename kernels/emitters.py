@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_gi.kernels.bvh import coverage, is_masked
-from warp_gi.kernels.sampling import triangle_barycentrics
+from warp_gi.kernels.emission_grids import emitter_point, emitter_point_density
 from warp_gi.kernels.surface import emitted_radiance
 from warp_gi.kernels.types import (
     EMITTER_DIRECTIONAL,
@@ -71,6 +71,21 @@ def triangle_light_pdf(scene: SceneData, face: wp.int32, direction: wp.vec3, dis
     return distance * distance / projected
 
 
+# Solid-angle pdf with which the point (u, v) of an emissive triangle is sampled once its emitter is selected.
+@wp.func
+def hit_light_pdf(
+    scene: SceneData,
+    emitter: wp.int32,
+    face: wp.int32,
+    u: wp.float32,
+    v: wp.float32,
+    direction: wp.vec3,
+    distance: wp.float32,
+) -> wp.float32:
+    pdf = triangle_light_pdf(scene, face, direction, distance)
+    return pdf * emitter_point_density(scene, emitter, u, v)
+
+
 # Falloff of KHR_lights_punctual: inverse square, ended smoothly at `range`.
 @wp.func
 def distance_falloff(distance: wp.float32, range: wp.float32) -> wp.float32:
@@ -117,7 +132,8 @@ def sample_emitter(scene: SceneData, position: wp.vec3, choice: LightChoice, u: 
         return r
     light = scene.emitters.emitters[choice.item]
     if light.kind == EMITTER_TRIANGLE:
-        b = triangle_barycentrics(u)
+        point = emitter_point(scene, choice.item, u)
+        b = point.b
         ids = scene.geometry.indices[light.triangle]
         p0 = scene.geometry.points[ids[0]]
         p1 = scene.geometry.points[ids[1]]
@@ -135,7 +151,7 @@ def sample_emitter(scene: SceneData, position: wp.vec3, choice: LightChoice, u: 
             covered = coverage(scene.bvh, light.triangle, b[0], b[1])
             if covered <= 0.0:
                 return r
-        r.pdf = choice.pdf * triangle_light_pdf(scene, light.triangle, r.direction, r.distance)
+        r.pdf = choice.pdf * point.density * triangle_light_pdf(scene, light.triangle, r.direction, r.distance)
         r.radiance = emitted_radiance(scene, light.triangle, b[0], b[1]) * covered
         return r
     r = punctual_light(light, position)

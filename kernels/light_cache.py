@@ -333,6 +333,14 @@ def shape_lights(
         shape.p0 = scene.geometry.points[ids[0]]
         shape.p1 = scene.geometry.points[ids[1]]
         shape.p2 = scene.geometry.points[ids[2]]
+        if scene.emitters.grids.shape[0] > 0:  # the part that shines
+            lit = scene.emitters.grids[emitter].lit
+            side1 = shape.p1 - shape.p0
+            side2 = shape.p2 - shape.p0
+            size = lit[2] - lit[0] - lit[1]
+            shape.p0 = shape.p0 + side1 * lit[0] + side2 * lit[1]
+            shape.p1 = shape.p0 + side1 * size
+            shape.p2 = shape.p0 + side2 * size
         shape.luminance = luminances[emitter]
         shape.two_sided = scene.materials[scene.geometry.materials[light.triangle]].double_sided
     shapes[emitter] = shape

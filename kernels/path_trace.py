@@ -21,7 +21,7 @@ import warp as wp
 from warp_gi.kernels.bsdf import diffuse_part, luminance
 from warp_gi.kernels.bvh import BvhHit, bvh_intersect, bvh_occluded
 from warp_gi.kernels.denoise import LEAST_REFLECTANCE, divided
-from warp_gi.kernels.emitters import may_hit_emitter, triangle_light_pdf
+from warp_gi.kernels.emitters import hit_light_pdf, may_hit_emitter
 from warp_gi.kernels.gbuffer import CameraData, PassSettings, PrimaryHits, tiled_pixel
 from warp_gi.kernels.light_connections import (
     connect_direction,
@@ -438,7 +438,7 @@ def _made(
             emitter = scene.geometry.emitters[hit.face]
             if sees_emitters and emitter >= 0:
                 light = wp.cw_mul(throughput, surface_emission(scene, hit.face, hit.u, hit.v, -wi))
-                pdf = triangle_light_pdf(scene, hit.face, wi, hit.t)
+                pdf = hit_light_pdf(scene, emitter, hit.face, hit.u, hit.v, wi, hit.t)
                 pdf = pdf * lights.pdf(samplers.lights, scene, region, s, wo, emitter)
                 light = light * balance(b.pdf, emitter_share * pdf)
                 if at_first:

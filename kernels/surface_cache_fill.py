@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_gi.kernels.bsdf import Bsdf, diffuse_share, lambert
 from warp_gi.kernels.bvh import BvhHit, bvh_intersect
-from warp_gi.kernels.emitters import LightChoice, triangle_light_pdf
+from warp_gi.kernels.emitters import LightChoice, hit_light_pdf
 from warp_gi.kernels.environment import environment_lookup, environment_sample
 from warp_gi.kernels.gbuffer import CameraData, camera_origin, camera_ray
 from warp_gi.kernels.light_connections import connect_emitter, connect_sky, light_1d, light_2d
@@ -173,7 +173,7 @@ def met_light(
     emitter = scene.geometry.emitters[hit.face]
     if emitter < 0:
         return wp.vec3(0.0, 0.0, 0.0)
-    light_pdf = triangle_light_pdf(scene, hit.face, wi, hit.t)
+    light_pdf = hit_light_pdf(scene, emitter, hit.face, hit.u, hit.v, wi, hit.t)
     light_pdf = light_pdf * fill_light_pdf(settings, scene, white, wo, emitter)
     return surface_emission(scene, hit.face, hit.u, hit.v, -wi) * (wp.pi * balance(pdf, light_pdf))
 

@@ -10,7 +10,7 @@ from warp_gi.kernels.alias import alias_choice
 from warp_gi.kernels.atlas import SurfaceAtlas, atlas_nearest, side_seen
 from warp_gi.kernels.atlas_slots import AtlasSlots, slot_surface
 from warp_gi.kernels.bvh import bvh_intersect, bvh_occluded
-from warp_gi.kernels.emitters import LightChoice, may_hit_emitter, sample_emitter, triangle_light_pdf
+from warp_gi.kernels.emitters import LightChoice, hit_light_pdf, may_hit_emitter, sample_emitter
 from warp_gi.kernels.light_connections import SHADOW_END
 from warp_gi.kernels.sampling import (
     TRANSFER_DIRECTION_DIMENSION,
@@ -222,7 +222,8 @@ def lamp_by_ray(
         face = lamps.faces[face]
     if face < 0 or scene.geometry.emitters[face] < 0:
         return wp.vec3()
-    pdf = triangle_light_pdf(scene, face, direction, hit.t) * scene.emitters.alias[scene.geometry.emitters[face]].pdf
+    emitter = scene.geometry.emitters[face]
+    pdf = hit_light_pdf(scene, emitter, face, hit.u, hit.v, direction, hit.t) * scene.emitters.alias[emitter].pdf
     light = surface_emission(scene, face, hit.u, hit.v, -direction)
     return light * (wp.pi * balance(cosine / wp.pi, pdf))
 

@@ -117,6 +117,14 @@ class Emitter:
     range: wp.float32  # metres; light ends there; 0 is no limit
 
 
+# How points are chosen on an emissive triangle; see emission_grids.py.
+@wp.struct
+class EmissionGrid:
+    start: wp.int32  # first cell in Emitters.cells and Emitters.densities
+    side: wp.int32  # the triangle has side^2 cells; 0: points are chosen evenly
+    lit: wp.vec3  # least u, least v and largest u + v (barycentric) of where it shines
+
+
 @wp.struct
 class Emitters:
     count: wp.int32
@@ -124,6 +132,9 @@ class Emitters:
     alias: wp.array(dtype=AliasBucket)  # [count] table of the current light sampler
     lower: wp.vec3  # box around all emissive triangles; empty (lower > upper) if there are none
     upper: wp.vec3
+    grids: wp.array(dtype=EmissionGrid)  # [emissive triangle]; empty where points are chosen evenly on all of them
+    cells: wp.array(dtype=AliasBucket)  # [cell] a table of each grid, one after another
+    densities: wp.array(dtype=wp.vec4)  # [cell] over that of uniform points: rising to each corner, and everywhere
 
 
 # One way in which triangles let rays pass. Their coverage is the texture's alpha times `factor`, or 0 below `cutoff`

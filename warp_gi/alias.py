@@ -22,12 +22,16 @@ class AliasTable:
     pdf: np.ndarray
     """Probability of each item as the table really samples it, float32 [n]; sums to 1."""
 
-    def on(self, device: wp.Device) -> wp.array:
-        """Return the buckets that kernels read, [n] of types.AliasBucket, on a device."""
+    def buckets(self) -> np.ndarray:
+        """Return the buckets that kernels read, types.AliasBucket [n]."""
         buckets = np.empty(len(self.pdf), types.AliasBucket.numpy_dtype())
         buckets["probability"], buckets["index"] = self.probability, self.index
         buckets["pdf"], buckets["index_pdf"] = self.pdf, self.pdf[self.index]
-        return on_device(buckets, types.AliasBucket, device)
+        return buckets
+
+    def on(self, device: wp.Device) -> wp.array:
+        """Return the buckets that kernels read, [n] of types.AliasBucket, on a device."""
+        return on_device(self.buckets(), types.AliasBucket, device)
 
     @staticmethod
     def build(weights: np.ndarray) -> AliasTable:

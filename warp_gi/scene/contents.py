@@ -12,6 +12,7 @@ from warp_gi.scene.model import Material, Node, PunctualLight
 from warp_gi.scene.poses import Pose
 
 if TYPE_CHECKING:
+    from warp_gi.scene.emission_grids import LightGrids
     from warp_gi.scene.environment import Environment
 
 
@@ -26,6 +27,8 @@ class SceneContents(Protocol):
     """Copy of the geometry of all nodes at time 0, in world space."""
     _emissive: np.ndarray
     """Indices of the triangles that emit, int64 [emissive triangle]."""
+    _light_grids: LightGrids
+    """How points on them are sampled."""
     _moving: list[bool]
     """Whether each node moves, by its index."""
     _poses: list[Pose]

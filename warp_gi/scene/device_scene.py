@@ -68,6 +68,12 @@ class DeviceScene:
         data.emitters.count = len(self.emitters)
         data.emitters.emitters = self._array(self.emitters, types.Emitter)
         data.emitters.alias = wp.empty(0, dtype=types.AliasBucket, device=device)
+        if not scene._devices:
+            scene._light_grids.forget()  # materials may have been edited until now
+        self.grids = scene._light_grids.get()
+        data.emitters.grids = self._array(self.grids.table, types.EmissionGrid)
+        data.emitters.cells = self._array(self.grids.cells, types.AliasBucket)
+        data.emitters.densities = self._array(self.grids.densities, wp.vec4)
         self._bound_emitters(data.emitters)
         low, high = scene.bounds
         data.center = wp.vec3(*(float(x) for x in (low.astype(np.float64) + high) / 2.0))
@@ -105,7 +111,7 @@ class DeviceScene:
     def placed_emitters(self) -> emitters.PlacedEmitters:
         triangles = self.scene._emissive
         corners = self.flat.points[self.flat.indices[triangles]].astype(np.float64)
-        return emitters.PlacedEmitters(self.emitters.copy(), corners, self.two_sided)
+        return emitters.PlacedEmitters(self.emitters.copy(), self.grids.lit_corners(corners), self.two_sided)
 
     def set_environment(self, environment: Environment | None) -> None:
         self.data.environment = types.Environment() if environment is None else environment.data(self.device)

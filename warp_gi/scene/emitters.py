@@ -32,7 +32,8 @@ class PlacedEmitters:
     table: np.ndarray
     """Emitters, types.Emitter [emitter]: emissive triangles first, then punctual lights."""
     corners: np.ndarray
-    """Corners in world space of the table's emissive triangles, metres, float64 [emissive triangle, 3, 3]."""
+    """Corners in world space of the table's emissive triangles, or of smaller ones that hold all that shines of them;
+    metres, float64 [emissive triangle, 3, 3]."""
     two_sided: np.ndarray
     """Whether both sides shine, bool [emissive triangle]."""
 
@@ -68,6 +69,15 @@ def check_light(light: PunctualLight, nodes: Sequence[Node]) -> None:
         raise SceneError(f"{name}: node must be from 0 to {len(nodes) - 1}, got {light.node}")
 
 
+def emitting_areas(flat: FlatGeometry, triangles: np.ndarray) -> np.ndarray:
+    """Return the areas in square metres of triangles (int64 [count]), one side of each; means over time if they change."""
+    if flat.mean_areas is not None:
+        return flat.mean_areas[triangles]
+    corners = flat.points[flat.indices[triangles]]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return 0.5 * np.linalg.norm(cross.astype(np.float64), axis=1)
+
+
 def emissive_triangles(flat: FlatGeometry, materials: Sequence[Material]) -> tuple[np.ndarray, np.ndarray]:
     """Return the triangles that emit (int64 [count], rising) and their powers (float64 [count]).
 
@@ -77,12 +87,7 @@ def emissive_triangles(flat: FlatGeometry, materials: Sequence[Material]) -> tup
     """
     shining = np.array([max(m.emission) > 0.0 for m in materials])
     triangles = np.flatnonzero(shining[flat.materials])
-    if flat.mean_areas is None:
-        corners = flat.points[flat.indices[triangles]]
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        powers = np.pi * 0.5 * np.linalg.norm(cross.astype(np.float64), axis=1)
-    else:
-        powers = np.pi * flat.mean_areas[triangles]
+    powers = np.pi * emitting_areas(flat, triangles)
     powers[powers < np.pi * SMALLEST_AREA] = 0.0
     for index in np.flatnonzero(shining).tolist():
         mine = flat.materials[triangles] == index
@@ -93,7 +98,9 @@ def emissive_triangles(flat: FlatGeometry, materials: Sequence[Material]) -> tup
             ids = flat.indices[triangles[mine]]
             further = None if flat.further_uvs is None else flat.further_uvs[ids]
             uvs = texture_coordinates(texture, flat.uvs[ids], further)
-            radiance = radiance * box_means(linear_rgb(texture), texture.wrap, uvs.min(axis=1), uvs.max(axis=1))
+            image, low, high = linear_rgb(texture), uvs.min(axis=1), uvs.max(axis=1)
+            means = [box_means(image[..., k : k + 1], texture.wrap, low, high) for k in range(3)]
+            radiance = radiance * np.concatenate(means, axis=1)
         if material.colors_emit and flat.colors is not None:
             radiance = radiance * flat.colors[flat.indices[triangles[mine]], :3].astype(np.float64).mean(axis=1)
         powers[mine] *= radiance @ LUMINANCE * (2.0 if material.double_sided else 1.0)

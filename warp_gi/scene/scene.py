@@ -17,6 +17,7 @@ from warp_gi.launch import get_device
 from warp_gi.scene import animation, copying, emitters, geometry, hashing, hulls, poses, textures
 from warp_gi.scene.device_scene import DeviceScene
 from warp_gi.scene.edits import Edits
+from warp_gi.scene.emission_grids import LightGrids
 from warp_gi.scene.model import Keyframe, Material, Node, PunctualLight
 from warp_gi.scene.sky_motion import appearance, first_sky, sky_at_time
 
@@ -100,7 +101,8 @@ class Scene:
             raise SceneError(f"scene {self.name!r}: node transforms move vertices past the range of float32")
         times = np.linspace(0.0, self.duration, POSES_FOR_AREAS)
         self._flat.mean_areas = emitters.mean_areas(self.nodes, self._flat, self._hulls, times)
-        self._emissive, self._triangle_powers = emitters.emissive_triangles(self._flat, self.materials)
+        self._emissive, powers = emitters.emissive_triangles(self._flat, self.materials)
+        self._light_grids = LightGrids(self._flat, self.materials, self._emissive, powers)
         self._bounds = self._all_bounds()
         self._devices: dict[str, DeviceScene] = {}
         self._geometry_hash: str | None = None
@@ -227,7 +229,7 @@ class Scene:
         Above zero for every emissive triangle; textures count by their mean under the triangle.
         """
         lights = [emitters.light_power(light, self.radius) for light in self.lights]
-        return np.concatenate([self._triangle_powers, lights])
+        return np.concatenate([self._light_grids.get().powers, lights])
 
     @property
     def geometry_hash(self) -> str:
