@@ -70,7 +70,7 @@ def check_light(light: PunctualLight, nodes: Sequence[Node]) -> None:
 
 
 def emitting_areas(flat: FlatGeometry, triangles: np.ndarray) -> np.ndarray:
-    """Return the areas in square metres of triangles (int64 [count]), one side of each; means over time if they change."""
+    """Return areas in square metres of triangles (int64 [count]), one side of each; means over time if they change."""
     if flat.mean_areas is not None:
         return flat.mean_areas[triangles]
     corners = flat.points[flat.indices[triangles]]
