@@ -5,7 +5,8 @@
 - ``settings: VisibilityField`` is a table of a dataclass's fields, with the docstrings below them;
 - ``flags: warp_gi.cli.render.Render`` is the same as flags of a command;
 - ``names: Scene Mesh`` is a table of names with the first line of their docstrings;
-- ``features: warp_gi.scene.files.support.FEATURES`` is a table of what scene files can hold.
+- ``features: warp_gi.scene.files.support.FEATURES`` is a table of what scene files can hold;
+- ``models: warp_gi.scene.files.feature_models.MODELS`` says what is rendered of models that use them.
 
 ``--check`` writes nothing, and leaves with exit code 1 if a page is not what it would write.
 """
@@ -25,10 +26,11 @@ from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import warp_gi
+from warp_gi.scene.files.support import BY_NAME
 
 DOCS = Path(__file__).parent
 REGION = re.compile(
-    r"(<!-- (?P<kind>settings|flags|names|features): (?P<what>[\w. ]+) -->\n).*?(?P<end><!-- end -->)", re.DOTALL
+    r"(<!-- (?P<kind>settings|flags|names|features|models): (?P<what>[\w. ]+) -->\n).*?(?P<end><!-- end -->)", re.DOTALL
 )
 
 
@@ -107,11 +109,22 @@ def features_table(name: str) -> str:
     return _table(("feature", "formats", "status", "what becomes of it"), rows)
 
 
+def models_table(name: str) -> str:
+    """Return what is rendered of models, which are given with the features that they use, as a Markdown table."""
+    rows = []
+    for model, features in named(name).items():
+        used = [BY_NAME[feature] for feature in features]
+        lacking = "; ".join(f"{one.name} ({one.status}): {one.how}" for one in used if one.status != "supported")
+        rows.append((model, ", ".join(features), lacking or "whole"))
+    return _table(("model", "features", "what is rendered"), rows)
+
+
 KINDS: dict[str, Callable[[str], str]] = {
     "settings": settings_table,
     "flags": flags_table,
     "names": names_table,
     "features": features_table,
+    "models": models_table,
 }
 
 

@@ -12,6 +12,7 @@ from scene_tools import GlbBuilder
 
 import warp_gi as gi
 from warp_gi.cli.main import main
+from warp_gi.scene.files.feature_models import MODELS
 from warp_gi.scene.files.support import BY_NAME, FEATURES, Findings
 
 CASES = Path(__file__).parents[1] / "cases"
@@ -140,3 +141,10 @@ def test_required_extensions_that_are_ignored_are_errors(tmp_path):
 
     with pytest.raises(gi.SceneError, match="requires KHR_materials_sheen, which is not supported"):
         gi.load_scene(one_triangle(tmp_path, change))
+
+
+def test_sample_models_are_told_in_the_words_of_the_table():
+    """Every feature of theirs is one of the table, and those of glTF that are read have a model."""
+    named = {feature for features in MODELS.values() for feature in features}
+    assert named <= BY_NAME.keys()
+    assert all("glTF" in BY_NAME[name].formats for name in named) and len(MODELS) > 40
