@@ -19,7 +19,7 @@ COLUMNS = columns(
     ),
     # the middle frame against the reference, and others
     measured(ERROR, "", "lower", "FLIP", "FLIP first", "FLIP last", "relMSE"),
-    measured(ERROR, "times", None, "mean", "mean first", "mean last", "mean of all"),
+    measured(ERROR, "times", None, "mean", "mean first", "mean last", "mean of judged"),
     measured(ERROR, "share of the light", "lower", "flicker", "fine error"),
     measured(ERROR, "", None, "alike at 1", "alike at 2"),
     measured(ERROR, "", "lower", "pattern"),

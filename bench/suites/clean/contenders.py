@@ -81,8 +81,6 @@ class Shots:
     """Renderer whose settings are other points of the same line in plots; ``renderer`` if not given."""
     pictures: dict[int, np.ndarray] = field(default_factory=dict)
     """Frames that are judged, by number."""
-    means: dict[int, float] = field(default_factory=dict)
-    """Means of all frames, by number."""
     times: dict[int, Times] = field(default_factory=dict)
     """Wall and CPU seconds of all frames, by number, without compilation."""
 
@@ -94,7 +92,6 @@ class Shots:
     def add(self, index: int, picture: np.ndarray, times: Times, judged: Iterable[int]) -> None:
         """Take over a frame."""
         self.times[index] = times
-        self.means[index] = float(picture.mean(dtype=np.float64))
         if index in judged:
             self.pictures[index] = picture
 

@@ -38,7 +38,7 @@ _ERRORS = Grid(
         _of("path 16, OIDN", "FLIP", OIDN, 16),
         GridColumn("reference, halves", Figure("FLIP of its halves", table=REFERENCE)),
         GridColumn("cleaned", Figure("FLIP of cleaned halves", table=REFERENCE)),
-        _of("clean: mean", "mean of all", CLEAN, digits=3, at_least="least mean", at_most="most mean"),
+        _of("clean: mean", "mean of judged", CLEAN, digits=3, at_least="least mean", at_most="most mean"),
         _of("first frame", "mean first", CLEAN, digits=3, at_least="least mean", at_most="most mean"),
         _of("path 1, OIDN", "mean", OIDN, digits=3),
     ),

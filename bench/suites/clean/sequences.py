@@ -104,20 +104,14 @@ def shots_row(case: SequenceCase, shots: Shots, truths: Truths, guides: Guides) 
     for name, frame in (("first", judged.first), ("last", judged.last)):
         there = truths[frame].quality(pictures[frame]) if frame in pictures else {}
         row |= {f"FLIP {name}": there.get("FLIP", ""), f"mean {name}": there.get("mean", "")}
-    whole = len(shots.means) == judged.count
-    row["mean of all"] = sum(shots.means.values()) / sum(means_between(truths, judged.count)) if whole else ""
+    told = [row[name] for name in ("mean first", "mean", "mean last")]
+    row["mean of judged"] = "" if "" in told else sum(told) / len(told)
     row |= steadiness(pictures[judged.middle], pictures[judged.before], middle, guides)
     later = [frame for frame in shots.times if frame not in (judged.first, min(shots.times))] or list(shots.times)
     wall, cpu = (np.array([shots.times[frame][kind] for frame in later]) for kind in (0, 1))
     row |= median_and_spread("s a frame", wall) | median_and_spread("us a pixel", cpu / pixels * 1e6)
     row["first frame s"] = shots.times[judged.first][0] if judged.first in shots.times else ""
     return row | dict.fromkeys((*ONLY_CLEAN, *LIMITS), "")
-
-
-def means_between(truths: Truths, count: int) -> np.ndarray:
-    """Return the means of all frames, by a parabola through those of the references."""
-    frames, means = np.array([[frame, truth.mean] for frame, truth in truths.items()]).T
-    return np.asarray(np.polyval(np.polyfit(frames, means, 2), np.arange(count)))
 
 
 def steadiness(picture: np.ndarray, before: np.ndarray, middle: Truth, guides: Guides) -> Row:
