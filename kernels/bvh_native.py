@@ -107,6 +107,7 @@ TRANSPARENT = (
     ALPHA
     + """
     if (chance == 2) return alpha < 1e-4f;
+    if (chance == 3) return alpha < 1.0f || mask.through > 0.0f;
     if (alpha <= 0.0f) return true;
     float stops = alpha;
     if (mask.through > 0.0f) {

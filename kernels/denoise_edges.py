@@ -255,7 +255,7 @@ def with_sample(
         r.reflected += wp.cw_mul(seen.diffuse, known.diffuse) + wp.cw_mul(glossy_scale(seen.specular), known.glossy)
         r.shining += seen.emission
         if seen.left > 0.0:
-            r.shining += environment_radiance(scene.environment, direction) * seen.left
+            r.shining += wp.cw_mul(environment_radiance(scene.environment, direction), seen.tint) * seen.left
         r.count += 1.0
         r.hits += 1.0 - seen.left
     return r

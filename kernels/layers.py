@@ -7,7 +7,7 @@ emission. These kernels take a scene whose tree has `chance` 2: what lets rays p
 import warp as wp
 
 from warp_gi.kernels.bsdf import average_specular
-from warp_gi.kernels.bvh import bvh_intersect, coverage, is_masked, transmitted
+from warp_gi.kernels.bvh import BvhHit, bvh_intersect, coverage, is_masked, transmitted
 from warp_gi.kernels.environment import environment_radiance
 from warp_gi.kernels.gbuffer import (
     CameraData,
@@ -22,11 +22,14 @@ from warp_gi.kernels.gbuffer import (
     project,
     view_distance,
 )
-from warp_gi.kernels.surface import shading_normal, surface_at, surface_emission
+from warp_gi.kernels.panes import glass_tint, has_panes
+from warp_gi.kernels.surface import Surface, shading_normal, surface_at, surface_emission
 from warp_gi.kernels.types import SceneData
 
 wp.set_module_options({"enable_backward": False})
 
+PAST_HIT = wp.constant(wp.float32(1.0002))  # of the way to a layer, so that its own tint counts for what is behind
+PAST_END = wp.constant(wp.float32(1.00001))  # of the way to what ends a ray, up to which layers lie before it
 MOST_LAYERS = wp.constant(64)
 LEAST_LEFT = wp.constant(wp.float32(1.0e-4))  # share of a ray that is not followed further
 
@@ -35,6 +38,7 @@ LEAST_LEFT = wp.constant(wp.float32(1.0e-4))  # share of a ray that is not follo
 @wp.struct
 class Layers:
     left: wp.float32  # share that meets nothing
+    tint: wp.vec3  # of what is behind the layers so far, over its luminance
     diffuse: wp.vec3
     specular: wp.vec3
     albedo: wp.vec3
@@ -46,37 +50,65 @@ class Layers:
     v: wp.float32
 
 
+# The sums with a layer that stops some share of the ray.
+@wp.func
+def with_layer(
+    layers: Layers, scene: SceneData, hit: BvhHit, s: Surface, direction: wp.vec3, share: wp.float32
+) -> Layers:
+    r = layers
+    r.left = wp.max(r.left - share, 0.0)
+    r.diffuse = r.diffuse + s.bsdf.diffuse * share
+    r.specular = r.specular + average_specular(s.bsdf) * share
+    r.albedo = r.albedo + s.base_color * share
+    r.normal = r.normal + shading_normal(s) * share
+    r.emission = r.emission + wp.cw_mul(surface_emission(scene, hit.face, hit.u, hit.v, -direction), r.tint) * share
+    if share > r.share:
+        r.share = share
+        r.face = hit.face
+        r.u = hit.u
+        r.v = hit.v
+    return r
+
+
+# All layers up to the closest surface that lets no ray pass, which is looked for first: so it is met however close a
+# layer lies before it, as a decal on a wall, and whatever share is left after the last layer is its.
 @wp.func
 def layers_along(scene: SceneData, start: wp.vec3, direction: wp.vec3) -> Layers:
     r = Layers()
     r.left = 1.0
+    r.tint = wp.vec3(1.0, 1.0, 1.0)
     r.face = -1
+    tree = scene.bvh
+    end = BvhHit()
+    end.face = -1
     origin = start
     count = int(0)
-    while r.left > 0.0 and count < MOST_LAYERS:
-        hit = bvh_intersect(scene.bvh, origin, direction, float(wp.inf))
-        if hit.face < 0:
-            break
-        s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
-        share = r.left
-        if scene.bvh.chance != 0 and is_masked(scene.bvh, hit.face):
+    if scene.bvh.chance != 0:
+        tree.chance = 3
+    while count <= MOST_LAYERS:
+        hit = bvh_intersect(tree, origin, direction, float(wp.inf))
+        if count == 0:
+            end = hit
+            if tree.chance == 0:
+                break
+            tree.chance = 2
+        else:
+            if hit.face < 0 or hit.face == end.face or not is_masked(scene.bvh, hit.face):
+                break
+            s = surface_at(scene, hit.face, hit.u, hit.v, -direction)
+            if end.face >= 0 and wp.dot(s.position - start, direction) > end.t * PAST_END:
+                break
             stops = 1.0 - transmitted(scene.bvh, hit.face, hit.u, hit.v, direction)[0]
-            share = r.left * stops * coverage(scene.bvh, hit.face, hit.u, hit.v)
-            if r.left - share < LEAST_LEFT:
-                share = r.left
-        r.left = r.left - share
-        r.diffuse = r.diffuse + s.bsdf.diffuse * share
-        r.specular = r.specular + average_specular(s.bsdf) * share
-        r.albedo = r.albedo + s.base_color * share
-        r.normal = r.normal + shading_normal(s) * share
-        r.emission = r.emission + surface_emission(scene, hit.face, hit.u, hit.v, -direction) * share
-        if share > r.share:
-            r.share = share
-            r.face = hit.face
-            r.u = hit.u
-            r.v = hit.v
-        origin = s.position - s.normal * s.offset
+            r = with_layer(r, scene, hit, s, direction, r.left * stops * coverage(scene.bvh, hit.face, hit.u, hit.v))
+            if has_panes(scene.panes):
+                r.tint = wp.cw_mul(r.tint, glass_tint(scene, origin, direction, hit.t * PAST_HIT))
+            if r.left < LEAST_LEFT:
+                break
+            origin = s.position - s.normal * s.offset
         count += 1
+    if end.face >= 0 and r.left > 0.0:
+        s = surface_at(scene, end.face, end.u, end.v, -direction)
+        r = with_layer(r, scene, end, s, direction, r.left)
     return r
 
 
@@ -108,7 +140,7 @@ def shade_layers(
     origin = camera_origin(camera, at[0], at[1])
     r = layers_along(scene, origin, direction)
     sky = environment_radiance(scene.environment, direction)
-    buffers.emission[pixel] = buffers.emission[pixel] + r.emission + sky * r.left
+    buffers.emission[pixel] = buffers.emission[pixel] + r.emission + wp.cw_mul(sky, r.tint) * r.left
     buffers.alpha[pixel] = buffers.alpha[pixel] + 1.0 - r.left
     buffers.albedo[pixel] = buffers.albedo[pixel] + r.albedo
     buffers.normal[pixel] = buffers.normal[pixel] + r.normal

@@ -29,6 +29,7 @@ SHADOW_END = wp.constant(wp.float32(0.9999))  # share of the way to an emitter t
 class LightConnection:
     arrives: wp.int32  # 1; 0 or, of an emitter with something in between, -1: it does not, and nothing else is set
     direction: wp.vec3
+    distance: wp.float32  # to the light; not of a mere direction
     reflected: wp.vec3  # f cos(wi) times the radiance (over the pdf already where `delta`); not of a mere direction
     scattered: wp.vec3  # f cos(wi); not of emitters
     pdf: wp.float32  # of the light sample; not of a mere direction
@@ -86,6 +87,7 @@ def connect_light(scene: SceneData, s: Surface, wo: wp.vec3, origin: wp.vec3, dr
         return r
     r.arrives = 1
     r.direction = drawn.direction
+    r.distance = drawn.distance
     r.reflected = wp.cw_mul(f.value, drawn.radiance)
     r.pdf = drawn.pdf
     r.bsdf_pdf = f.pdf

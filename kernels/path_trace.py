@@ -32,6 +32,7 @@ from warp_gi.kernels.light_connections import (
     light_1d,
     light_2d,
 )
+from warp_gi.kernels.panes import glass_tint, has_panes
 from warp_gi.kernels.path_samplers import (
     ALIAS_LIGHTS,
     BSDF_DIRECTIONS,
@@ -112,6 +113,29 @@ class PathRadiance:
     diffuse: wp.vec3
     glossy: wp.vec3
     apart: wp.vec3
+
+
+# Tint of a camera ray that has come a way of `t` to a point.
+@wp.func
+def tint_before(scene: SceneData, position: wp.vec3, direction: wp.vec3, t: wp.float32) -> wp.vec3:
+    if not has_panes(scene.panes):
+        return wp.vec3(1.0, 1.0, 1.0)
+    return glass_tint(scene, position - direction * t, direction, t)
+
+
+# The radiance of a path whose first vertex is seen through coloured glass.
+@wp.func
+def tinted(radiance: PathRadiance, scene: SceneData, tint: wp.vec3) -> PathRadiance:
+    if not has_panes(scene.panes):
+        return radiance
+    r = PathRadiance()
+    r.environment = wp.cw_mul(radiance.environment, tint)
+    r.emitters = wp.cw_mul(radiance.emitters, tint)
+    r.indirect = wp.cw_mul(radiance.indirect, tint)
+    r.diffuse = wp.cw_mul(radiance.diffuse, tint)
+    r.glossy = wp.cw_mul(radiance.glossy, tint)
+    r.apart = wp.cw_mul(radiance.apart, tint)
+    return r
 
 
 # Sums over samples, [height * width].
@@ -336,6 +360,9 @@ def _made(
                         beam = apart.sample(samplers.sky, scene, ray_origin(s), k, u_apart)
                         ray = connect_light(scene, s, wo, ray_origin(s), beam)
                         if ray.arrives > 0:
+                            if has_panes(scene.panes):
+                                tint = glass_tint(scene, ray_origin(s), ray.direction, ray.distance)
+                                ray.reflected = wp.cw_mul(ray.reflected, tint)
                             part = diffuse_part(s.bsdf, wo, wp.transpose(s.shading) * ray.direction)
                             by_diffuse = wp.cw_mul(part, ray.reflected)
                             by_glossy = ray.reflected - by_diffuse
@@ -352,6 +379,9 @@ def _made(
                 sky_sample = sky.sample(samplers.sky, scene, u_sky, at_first)
                 way = connect_direction(scene, s, wo, sky_sample.direction)
                 if way.arrives != 0:
+                    if has_panes(scene.panes):
+                        tint = glass_tint(scene, ray_origin(s), way.direction, float(wp.inf))
+                        way.scattered = wp.cw_mul(way.scattered, tint)
                     source = sky.arrival(samplers.sky, scene, sky_sample, at_first)
                     if source.pdf > 0.0:
                         pdf = directions.pdf(samplers.directions, region, s, way.direction, way.bsdf_pdf)
@@ -379,6 +409,9 @@ def _made(
                         sample = connect_emitter(scene, s, wo, choice, u_point)
                         light = wp.vec3(0.0, 0.0, 0.0)
                         if sample.arrives > 0:
+                            if has_panes(scene.panes):
+                                tint = glass_tint(scene, ray_origin(s), sample.direction, sample.distance)
+                                sample.reflected = wp.cw_mul(sample.reflected, tint)
                             light = sample.reflected * (choice.weight / emitter_share)
                             choice.selected = 1.0
                             if sample.delta == 0:
@@ -406,6 +439,11 @@ def _made(
                 break
             carried = luminance(throughput)
             throughput = wp.cw_mul(throughput, sample_weight(s.bsdf, b.weight))
+            if has_panes(scene.panes):
+                t_hit = float(wp.inf)
+                if hit.face >= 0:
+                    t_hit = hit.t
+                throughput = wp.cw_mul(throughput, glass_tint(scene, ray_origin(s), wi, t_hit))
             reflected = wp.cw_mul(reflected, sample_weight(s.bsdf, b.reflected))
             if at_first:
                 first_reflected = wp.max(reflected)
@@ -517,10 +555,12 @@ def _made(
         indirect = wp.vec3(0.0, 0.0, 0.0)
         moment1 = wp.vec3(0.0, 0.0, 0.0)
         moment2 = wp.vec3(0.0, 0.0, 0.0)
+        tint = tint_before(scene, s.position, direction, hits.t[pixel])
         first_index = pixel_sample_index(p[0], p[1], settings.first_sample, settings.sample_bits)
         for i in range(settings.sample_count):
             path = wp.int64(first + wp.tid()) * wp.int64(paths.spp) + wp.int64(settings.first_sample + i)
             r = trace_path(scene, samplers, hit, s, -direction, paths, first_index + wp.uint32(i), seed, path)
+            r = tinted(r, scene, tint)
             brightest = wp.max(r.indirect)
             if paths.clamp > 0.0 and brightest > paths.clamp:
                 r.indirect = r.indirect * (paths.clamp / brightest)

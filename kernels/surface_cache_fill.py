@@ -20,6 +20,7 @@ from warp_gi.kernels.gbuffer import CameraData, camera_origin, camera_ray
 from warp_gi.kernels.light_connections import connect_emitter, connect_sky, light_1d, light_2d
 from warp_gi.kernels.light_hierarchy import LightTree, hierarchy_light, hierarchy_light_pdf
 from warp_gi.kernels.ltc import LtcTable, lobe_albedo
+from warp_gi.kernels.panes import glass_tint, has_panes
 from warp_gi.kernels.path_samplers import AliasLights, alias_light, alias_light_pdf
 from warp_gi.kernels.sampling import (
     CACHE_PLACE_DIMENSION,
@@ -134,6 +135,8 @@ def add_lights(
         sky = connect_sky(scene, white, wo, environment_sample(scene.environment, wp.vec3(u[0], u[1], digits)))
         if sky.arrives > 0:
             light = sky.reflected * (wp.pi / (sky.pdf + sky.bsdf_pdf))
+            if has_panes(scene.panes):
+                light = wp.cw_mul(light, glass_tint(scene, ray_origin(s), sky.direction, float(wp.inf)))
             rho = lobe_reflectance(table, s.bsdf, wp.dot(shading_normal(s), sky.direction))
             r.irradiance = r.irradiance + light
             r.exitance = r.exitance + wp.cw_mul(rho, light)
@@ -146,6 +149,8 @@ def add_lights(
             light = sample.reflected * wp.pi
             if sample.delta == 0:
                 light = light / (sample.pdf + sample.bsdf_pdf)
+            if has_panes(scene.panes):
+                light = wp.cw_mul(light, glass_tint(scene, ray_origin(s), sample.direction, sample.distance))
             rho = lobe_reflectance(table, s.bsdf, wp.dot(shading_normal(s), sample.direction))
             r.irradiance = r.irradiance + light
             r.exitance = r.exitance + wp.cw_mul(rho, light)
@@ -200,6 +205,11 @@ def fill_step(
         r.rho = lobe_reflectance(table, s.bsdf, local[2])
         r.hit = bvh_intersect(scene.bvh, ray_origin(s), r.direction, float(wp.inf))
         light = met_light(scene, settings, white, wo, r.direction, local[2] / wp.pi, r.hit)
+        if has_panes(scene.panes):
+            t_hit = float(wp.inf)
+            if r.hit.face >= 0:
+                t_hit = r.hit.t
+            light = wp.cw_mul(light, glass_tint(scene, ray_origin(s), r.direction, t_hit))
         r.irradiance = r.irradiance + light
         r.exitance = r.exitance + wp.cw_mul(r.rho, light)
     return r

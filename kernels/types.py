@@ -160,7 +160,7 @@ class Bvh:
     face_masks: wp.array(dtype=wp.int32)  # [triangle] index in masks, -1 is opaque; empty where all are
     masks: wp.array(dtype=AlphaMask)
     points: wp.array(dtype=wp.vec3)  # [vertex] for glass; empty without it
-    chance: wp.int32  # 1: some masks let rays pass by chance; 2: they do not now, for layers.py; 0: none does
+    chance: wp.int32  # 1: some masks let rays pass by chance (for layers.py 2: they do not, 3: always); 0: none does
     salt: wp.uint32  # of chance; another one for each camera sample
     indices: wp.array(dtype=wp.vec3i)  # [triangle] for uvs; empty where all are opaque
     uvs: wp.array(dtype=wp.vec2)  # [vertex]
@@ -169,9 +169,18 @@ class Bvh:
     texels: wp.array(dtype=wp.uint32)  # RGBA8
 
 
+# Triangles of coloured glass.
+@wp.struct
+class Panes:
+    bvh: wp.uint64  # of a wp.Bvh over their boxes
+    faces: wp.array(dtype=wp.int32)  # [pane] triangle
+    count: wp.int32
+
+
 @wp.struct
 class SceneData:
     bvh: Bvh
+    panes: Panes
     geometry: Geometry
     materials: wp.array(dtype=Material)
     textures: wp.array(dtype=Texture)

@@ -118,13 +118,17 @@ def test_glass_is_seen_through():
     np.testing.assert_allclose(albedo, np.tile([0.04 + 0.96 * 0.8, 0.04, 0.04], (768, 1)), atol=2e-3)
 
 
-def test_coloured_glass_is_named(tmp_path):
-    extension = {"transmissionFactor": 0.5}
-    glb = square({"pbrMetallicRoughness": {"baseColorFactor": [0.1, 1, 0.1, 1], "metallicFactor": 0}})
-    glb.json["materials"][0]["extensions"] = {"KHR_materials_transmission": extension}
-    with pytest.warns(gi.UnsupportedWarning, match="colours of glass"):
-        scene = gi.load_scene(glb.write(tmp_path / "g.glb"))
-    assert scene.materials[0].transmission == 0.5
+def test_coloured_glass_tints_what_is_behind(tmp_path):
+    """Without a reflection, the sky through it has its base colour."""
+    glb = square({"pbrMetallicRoughness": {"baseColorFactor": [0.1, 1, 0.4, 1], "metallicFactor": 0}})
+    glb.json["materials"][0]["extensions"] = {
+        "KHR_materials_transmission": {"transmissionFactor": 1.0},
+        "KHR_materials_specular": {"specularFactor": 0.0},
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = loaded(glb, tmp_path)
+    np.testing.assert_allclose(picture(scene).numpy("emission")[12, 16], [0.1, 1.0, 0.4], rtol=1e-3)
 
 
 def test_unlit_with_colors_of_vertices(tmp_path):

@@ -118,10 +118,18 @@ def test_bakes_tell_orthographic_cameras_and_lens_shifts_apart():
             settings.check_view(bake, other)
 
 
+def test_a_strong_zoom_keeps_a_width():
+    """The curve through the widths of keys would pass below 0."""
+    keys = [camera(width=width) for width in (10.0, 1.0, 0.1, 0.1)]
+    path = CameraPath.from_cameras(keys, times=[0.0, 1.0, 2.0, 3.0])
+    widths = [path.camera_at(time).ortho_width for time in np.linspace(0, 3, 61)]
+    assert min(widths) >= 0.1 and max(widths) <= 10.0 and widths[-1] == 0.1
+
+
 def test_bad_cameras(tmp_path):
     with pytest.raises(OptionError, match="above 0 m, got 0"):
         gi.Camera.orthographic(EYE, TARGET, width=0)
-    with pytest.raises(OptionError, match="ortho_width must be finite and from 0 up, got nan"):
+    with pytest.raises(OptionError, match="ortho_width must be from 0 to 1e\\+15 m, got nan"):
         camera(width=1.0, ortho_width=float("nan"))
     with pytest.raises(OptionError, match="no field of view"):
         camera().with_vfov(40)

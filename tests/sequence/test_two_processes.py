@@ -88,6 +88,16 @@ def test_the_claim_of_a_dead_process_is_no_claim(tmp_path, holder, how):
     assert hidden(tmp_path) == []
 
 
+def test_brackets_in_names_are_no_patterns(tmp_path):
+    first, second = (Claim(tmp_path / "[x]a.####.exr", [0], False) for _ in range(2))
+    first.take()
+    with pytest.raises(OptionError, match="has been writing to"):
+        second.take()
+    first.release()
+    second.take()
+    second.release()
+
+
 def test_files_that_are_no_claims_stop_nothing(tmp_path):
     (tmp_path / ".a.____.exr.0123.lock").write_text("")
     (tmp_path / ".a.____.exr.0124.claim").write_text("{")

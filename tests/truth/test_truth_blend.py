@@ -214,3 +214,35 @@ def test_denoisers_keep_the_mean(name):
     expected = truth.numpy("beauty").mean(axis=(0, 1))
     assert expected[1] > 2 * expected[0]
     np.testing.assert_allclose(got, expected, rtol=0.03)
+
+
+VEIL = gi.Material("veil", (1, 1, 1), alpha=0.5, alpha_blend=True, specular=0.0)
+SOLID = gi.Material("wall", (1, 1, 1), specular=0.0)
+THIN = gi.Material("thin", (1, 1, 1), alpha=0.02, alpha_blend=True, specular=0.0)
+
+
+@pytest.mark.parametrize(
+    "nodes",
+    [
+        [pane(0.0, VEIL), pane(0.0, SOLID)],
+        [pane(0.0, SOLID), pane(0.0, VEIL)],
+        [pane(1e-5, VEIL), pane(0.0, SOLID)],
+        [*(pane(0.01 * k, THIN) for k in range(1, 101)), pane(0.0, SOLID)],
+    ],
+    ids=["decal", "decal after", "decal close by", "a hundred layers"],
+)
+def test_no_sky_shines_through_a_wall_behind_layers(nodes):
+    """Guides stop at the wall, however close or many the layers before it are: a white furnace all over."""
+    camera = gi.Camera.look_at((0, 0.01, 3), (0, 0.01, 0), hfov=30, resolution=(16, 12))
+    frame = next(gi.render(scene_of(*nodes, environment=1.0), camera, gi.Pipeline(spp=16, camera_samples=16)))
+    for name in ("beauty", "albedo"):
+        np.testing.assert_allclose(frame.numpy(name).mean(axis=(0, 1)), 1.0, rtol=2e-3)
+    np.testing.assert_allclose(frame.numpy("alpha"), 1.0, rtol=1e-5)
+
+
+def test_a_lamp_behind_a_decal_shines_through_it():
+    black = gi.Material("black", (0, 0, 0), alpha=0.5, alpha_blend=True, specular=0.0)
+    lamp = gi.Material("lamp", (0, 0, 0), emission=(2, 2, 2), specular=0.0)
+    camera = gi.Camera.look_at((0, 0.01, 3), (0, 0.01, 0), hfov=30, resolution=(16, 12))
+    frame = next(gi.render(scene_of(pane(0.0, black), pane(0.0, lamp)), camera, gi.Pipeline(spp=4)))
+    np.testing.assert_allclose(frame.numpy("emission"), 1.0, rtol=1e-3)

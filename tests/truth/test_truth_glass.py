@@ -93,6 +93,65 @@ def test_textures_of_transmission_and_tint():
     assert abs(stopped - (1 - 128 / 255)) < 0.015
 
 
+RED = (0.9, 0.3, 0.1)
+
+
+def colored(z, size=30.0, **fields):
+    return pane(z, glass(RED, **{"specular": 0.0} | fields), size)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_the_sky_through_coloured_panes_has_their_tints(count):
+    """Without a reflection, whatever the angle; it is emission of the pixels, and has no noise of its own."""
+    camera = gi.Camera.look_at((0.3, 0.2, 3), (0, 0.013, 0), hfov=5, resolution=(8, 8))
+    scene = scene_of(*(colored(0.2 * k) for k in range(count)), environment=tuple(SKY))
+    images = st.renderings(scene, camera, PATH, 24)
+    st.assert_mean(images, SKY * np.power(RED, count), tolerance=2e-3)
+
+
+def test_a_coloured_pane_that_is_half_there_tints_half():
+    """Alpha of 0.4: the rest of the light passes beside the glass, white."""
+    camera = gi.Camera.look_at((0, 0.013, 3), (0, 0.013, 0), hfov=5, resolution=(8, 8))
+    scene = scene_of(colored(0.0, alpha=0.4, alpha_blend=True), environment=tuple(SKY))
+    st.assert_mean(st.renderings(scene, camera, PATH, 40), SKY * (0.6 + 0.4 * np.array(RED)), tolerance=4e-3)
+
+
+@pytest.mark.parametrize("kind", ["sun", "lamp", "sky"])
+def test_light_through_a_coloured_pane_has_its_tint(kind):
+    """On the ground below it: by a light without size, by an emitter, and by the sky; seen from below the pane."""
+    above = quad((-40, 1, 40), (80, 0, 0), (0, 0, -80), glass(RED, specular=0.0), "pane")
+    camera = gi.Camera.look_at((0.02, 0.5, 0.03), (0, 0, 0), up=(0, 0, 1), hfov=0.1, resolution=(4, 4))
+    lamp = quad((-0.2, 2, 0.2), (0.4, 0, 0), (0, 0, -0.4), gi.Material("lamp", (0, 0, 0), emission=(9, 9, 9)), "lamp")
+    lights = [gi.PunctualLight("directional", (3.0, 3.0, 3.0), direction=(0, -1, 0))] if kind == "sun" else []
+    nodes = [ground(size=0.5), *([lamp] if kind == "lamp" else [])]
+    sky = 1.0 if kind == "sky" else None
+    pipeline = gi.Pipeline(spp=64, camera_samples=64, indirect=None)
+    without, through = (
+        st.renderings(scene_of(*nodes, *more, lights=lights, environment=sky), camera, pipeline, 60)
+        for more in ([], [above])
+    )
+    st.assert_mean(through, without.mean(axis=(0, 1, 2)) * np.array(RED), tolerance=0.02)
+
+
+def test_a_coloured_pane_takes_its_tint_along():
+    """It moves before the camera, and its tree with it."""
+    keys = [gi.Keyframe(0.0), gi.Keyframe(1 / 24, translation=(20.0, 0.0, 0.0))]
+    node = gi.Node("pane", [colored(0.0, 4.0)], keyframes=keys)
+    camera = gi.Camera.look_at((0, 0.013, 3), (0, 0.013, 0), hfov=5, resolution=(8, 8))
+    path = gi.CameraPath.still(camera)
+    frames = gi.render(gi.Scene([node], environment=1.0), path, PATH, frames=[0, 1, 0])
+    means = [frame.numpy("emission").mean(axis=(0, 1)) for frame in frames]
+    np.testing.assert_allclose(means, [RED, (1, 1, 1), RED], rtol=2e-3)
+
+
+def test_metal_by_a_texture_alone_is_no_metal_where_that_is_black():
+    """glTF's factor is 1 unless a file says otherwise; glass often leaves that to its texture."""
+    texture = gi.Texture("mr", np.uint8([[[0, 0, 0, 255]]]), srgb=False)
+    material = glass(metallic=1.0, metallic_roughness_texture=texture)
+    assert material.is_glass and not glass(metallic=1.0).is_glass
+    st.assert_mean(seen_through(45.0, material), SKY, tolerance=2e-3)
+
+
 def test_guides_show_what_is_behind_a_window():
     red = gi.Material("red", (0.8, 0.0, 0.0), specular=0.0)
     scene = scene_of(pane(0.0, glass()), pane(-1.0, red), environment=(1, 1, 1))

@@ -110,6 +110,7 @@ class CameraPath:
         pose = _hermite(np.array([k.time for k in keys]), rows, time)
         camera = Camera.look_at(pose[0:3], pose[3:6], pose[6:9], float(pose[9]), self.resolution, self.name)
         right, above, pixel_aspect, width = pose[10:].tolist()
+        width = float(np.clip(width, rows[:, -1].min(), rows[:, -1].max()))  # a curve may pass below 0
         shift = right, above
         return replace(camera, offset=self.offset, lens_shift=shift, pixel_aspect=pixel_aspect, ortho_width=width)
 

@@ -14,6 +14,7 @@ from warp_gi.errors import SceneError
 from warp_gi.kernels import types
 from warp_gi.launch import on_device
 from warp_gi.scene import animation, emitters, geometry, textures
+from warp_gi.scene.panes import Panes
 from warp_gi.scene.poses import Pose, poses
 
 if TYPE_CHECKING:
@@ -84,6 +85,8 @@ class DeviceScene:
         self._static_bvh: TriangleBvh | None = None
         self._light_table: wp.array | None = None
         data.bvh = self.bvh.data
+        self.panes = Panes(flat, scene.materials, device)
+        data.panes = self.panes.data
         self.data = data
         self.set_environment(scene.environment)
 
@@ -148,6 +151,7 @@ class DeviceScene:
             self._upload(self.data.emitters.emitters, self.emitters, len(self.scene._emissive), len(self.emitters))
         if moved:
             self.bvh.refit(flat.points)
+            self.panes.refit(flat.points)
             self._bound_emitters(self.data.emitters)
         self.poses, self.previous_poses = now, before
         return moved or changed

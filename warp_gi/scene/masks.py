@@ -52,7 +52,7 @@ def alpha_masks(
         if material.is_glass:
             holed = triangles
             tint = tints.get(index)
-            share = _brightest(material) * material.transmission * (1.0 - material.metallic)
+            share = _brightest(material) * material.transmission * (1.0 - material.mean_metallic)
             glass[len(masks)] = share, -1 if tint is None else index_of[id(tint)], *_reflectance(material)
         if len(holed):
             face_mask[holed] = len(masks)
@@ -105,6 +105,6 @@ def _brightest(material: Material) -> float:
 
 def _reflectance(material: Material) -> tuple[float, float]:
     """Return the reflectance at normal incidence and at grazing angles, as make_coated_bsdf of kernels/bsdf.py."""
-    dielectric, metallic = 1.0 - material.metallic, material.metallic
+    dielectric, metallic = 1.0 - material.mean_metallic, material.mean_metallic
     f0 = float(np.minimum(material.reflectance, 1.0) @ LUMINANCE) * material.specular * dielectric
     return f0 + _brightest(material) * metallic, material.specular * dielectric + metallic

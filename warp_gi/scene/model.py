@@ -84,7 +84,13 @@ class Material:
     @property
     def is_glass(self) -> bool:
         """Whether light goes straight through it."""
-        return self.transmission > 0.0 and self.metallic < 1.0
+        return self.transmission > 0.0 and self.mean_metallic < 1.0
+
+    @property
+    def mean_metallic(self) -> float:
+        """``metallic``, times the mean of its texture."""
+        texture = self.metallic_roughness_texture
+        return self.metallic * (1.0 if texture is None else float(texture.pixels[..., 2].mean()) / 255.0)
 
     @property
     def has_chance(self) -> bool:

@@ -87,8 +87,10 @@ class Camera:
         if not (self.pixel_aspect > 0 and math.isfinite(self.pixel_aspect)):
             raise OptionError(f"camera {self.name!r}: pixel_aspect must be finite and above 0, got {self.pixel_aspect}")
         check_number(f"camera {self.name!r}: ortho_width", self.ortho_width)
-        if not (self.ortho_width >= 0 and math.isfinite(self.ortho_width)):
-            raise OptionError(f"camera {self.name!r}: ortho_width must be finite and from 0 up, got {self.ortho_width}")
+        if not 0 <= self.ortho_width <= FARTHEST:
+            raise OptionError(
+                f"camera {self.name!r}: ortho_width must be from 0 to {FARTHEST:g} m, got {self.ortho_width}"
+            )
         if np.shape(self.lens_shift) != (2,):
             raise OptionError(f"camera {self.name!r}: lens_shift must be two finite numbers, got {self.lens_shift!r}")
         for shift in self.lens_shift:

@@ -148,7 +148,7 @@ def visibility_parts(material: Material) -> list[np.ndarray | str]:
     if by_alpha and texture is not None:
         parts += [repr((texture.wrap, texture.nearest)), texture.pixels[..., 3]]
     if material.is_glass:
-        numbers = [material.transmission, material.metallic, material.specular]
+        numbers = [material.transmission, material.mean_metallic, material.specular]
         parts += ["glass", np.array([*numbers, *material.reflectance, *material.base_color])]
         if texture is not None:
             parts += [repr((texture.wrap, texture.nearest, texture.srgb)), texture.pixels]

@@ -7,6 +7,7 @@ it however the process ends, in a container too. What nobody holds is removed by
 from __future__ import annotations
 
 import contextlib
+import glob
 import json
 import os
 import socket
@@ -77,7 +78,7 @@ class Claim:
         os.replace(part, self.path)  # nobody sees it before it is locked
         self._file = file
         for other in self._others():
-            if self._is_later(other) and self._is_against(other):
+            if self._is_against(other):
                 self.release()
                 since = time.strftime("%H:%M:%S", time.localtime(other["started"]))
                 raise OptionError(
@@ -95,7 +96,7 @@ class Claim:
 
     def _others(self) -> Iterator[dict[str, Any]]:
         """Yield what other living processes claim, and remove what dead ones left."""
-        for path in sorted(self.pattern.parent.glob(f"{self._prefix}*")):
+        for path in sorted(self.pattern.parent.glob(f"{glob.escape(self._prefix)}*")):
             if path.suffix not in (".lock", ".claim") or path == self.path:
                 continue
             with contextlib.suppress(OSError, ValueError):  # gone, or of a process that is ending
@@ -108,12 +109,15 @@ class Claim:
                 except BlockingIOError:
                     about = json.loads(os.read(file, 1 << 24))
                     if path.suffix == ".lock" and about["pattern"] == self.pattern.name:
-                        yield about
+                        if self._published(path) <= self._published(self.path):  # it may not have seen this claim
+                            yield about
                 finally:
                     os.close(file)
 
-    def _is_later(self, other: dict[str, Any]) -> bool:
-        return (other["started"], other["name"]) < (self._about["started"], self._about["name"])
+    @staticmethod
+    def _published(path: Path) -> tuple[int, str]:
+        """Return when a claim was given its name, by the clock of the file system."""
+        return path.stat().st_ctime_ns, path.name
 
     def _is_against(self, other: dict[str, Any]) -> bool:
         both_whole = bool(other["is_whole"] and self._about["is_whole"])

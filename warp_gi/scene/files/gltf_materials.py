@@ -10,7 +10,6 @@ import numpy as np
 
 from warp_gi.color import SRGB_TO_LINEAR, encode_srgb
 from warp_gi.errors import SceneError
-from warp_gi.scene.files.glass import has_colored_tint
 from warp_gi.scene.files.gltf_buffers import Buffers, decode_data_uri
 from warp_gi.scene.files.gltf_document import Document, Part
 from warp_gi.scene.files.images import find_file, read_image
@@ -114,8 +113,6 @@ class MaterialReader:
                 normal_texture=None,
                 colors_emit=True,
             )
-        if has_colored_tint(result):
-            document.findings.add("colours of glass", what)
         return result, coordinates
 
     def _coordinates(self, old: Part, surface: Part, source: Part, coat: Part, through: Part, what: str) -> Coordinates:

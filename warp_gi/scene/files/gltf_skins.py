@@ -18,6 +18,8 @@ class Bones:
     name: str
     joints: list[int]
     joint_from_mesh: np.ndarray
+    made: Skin | None = None
+    """The skin in the scene, once a node uses it."""
 
     def placed(self, document: Document, numbers: dict[int, int], owner: str) -> Skin:
         """Return the skin with the numbers that its joints have in the scene; ``owner`` is a node that uses it."""
@@ -26,7 +28,9 @@ class Bones:
                 raise document.error(
                     self.name, f"its joint {document.name('nodes', joint)} is not in the scene, as {owner} is"
                 )
-        return Skin([numbers[joint] for joint in self.joints], self.joint_from_mesh, self.name)
+        if self.made is None:  # one for all nodes: what follows from it is computed once
+            self.made = Skin([numbers[joint] for joint in self.joints], self.joint_from_mesh, self.name)
+        return self.made
 
 
 class SkinReader:

@@ -20,12 +20,12 @@ from pathlib import Path
 import numpy as np
 
 from warp_gi.errors import SceneError
-from warp_gi.scene.files.glass import GREY_STEP, has_colored_tint
 from warp_gi.scene.files.images import find_file, read_image
 from warp_gi.scene.files.support import Findings
 from warp_gi.scene.files.text import decode, joined, read_bytes, uncommented, without_comment
 from warp_gi.scene.model import Material, Texture
 
+GREY_STEP = 0.02  # difference between channels below which a colour is grey
 METAL_SPECULAR = 0.25
 OPTION_ARGUMENTS = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}
 """Number of arguments of MTL map options that take more or fewer than one."""
@@ -167,7 +167,7 @@ class MtlReader:
         return material, self._transform(name, source)
 
     def _is_glass(self, source: MtlMaterial) -> bool:
-        is_clear = "map_d" not in source.maps and _coverage(source.numbers) < 1.0
+        is_clear = "map_d" not in source.maps and _coverage(source.numbers) < 1.0 and "tf" in source.numbers
         return is_clear and int(_first(source.numbers, "illum", 2.0)) in GLASS_MODELS
 
     def _glass(self, name: str, source: MtlMaterial) -> Material:
@@ -177,17 +177,15 @@ class MtlReader:
         index = _first(numbers, "ni", 1.5)
         reflectance = ((index - 1.0) / (index + 1.0)) ** 2 if index > 1.0 else 0.04
         shininess = _first(numbers, "ns", np.inf)
-        result = Material(
+        return Material(
             name,
             base_color=(red, green, blue),
             roughness=float((2.0 / (max(shininess, 0.0) + 2.0)) ** 0.25),
             reflectance=(reflectance,) * 3,
             normal_texture=self._texture(name, source, "norm", srgb=False),
             transmission=1.0 - _coverage(numbers),
+            emission=tuple(_color(numbers, "ke", 0.0).tolist()),
         )
-        if has_colored_tint(result):
-            self.findings.add("colours of glass", f"material {name!r}")
-        return result
 
     def _note(self, name: str, source: MtlMaterial) -> None:
         """Note statements that are not read in full."""

@@ -73,6 +73,7 @@ FEATURES: tuple[Feature, ...] = (
         ("orthographic cameras", GLTF, "their xmag in pictures of any shape; znear and zfar cut nothing off"),
         ("polygons, concave ones too", f"{OBJ}, {PLY}", "triangles: fans, or ear clipping of concave ones"),
         ("MTL: Kd, Ks, Ns, Ke, d, Tr, Pr, Pm and their maps", OBJ, "metallic-roughness materials"),
+        ("colours of glass", f"{GLTF}, {OBJ}", "tint paths and shadow rays; bakes take their luminance"),
         ("textures named by a path of another machine", OBJ, "looked for by their bare names beside the MTL file"),
     ),
     *_features(
@@ -80,7 +81,6 @@ FEATURES: tuple[Feature, ...] = (
         ("KHR_materials_pbrSpecularGlossiness", GLTF, "converted to metallic-roughness; pure Lambert without specular"),
         ("KHR_materials_unlit", GLTF, "emits its base colour, reflects nothing, and lights what is around it"),
         ("a third set of texture coordinates", GLTF, "two sets for the textures of a material"),
-        ("colours of glass", f"{GLTF}, {OBJ}", "what is seen through it is dimmed by the luminance of its tint"),
         ("KHR_materials_variants", GLTF, "the materials without a variant"),
         (
             "colours of vertices above 1",
