@@ -14,9 +14,12 @@ from warp_gi.launch import on_device
 from warp_gi.scene.environment import Environment
 
 Evaluator = Literal["adaptive", "exact"]
+EVALUATORS: tuple[Evaluator, ...] = ("adaptive", "exact")
 BRIGHT, BRIGHT_MEANS = 1e-3, 8.0
 """Share of the sky's flux above which a texel's excess is integrated exactly, in a band of columns; in means of texels,
 if that is more."""
+EXACT_COLUMNS = 512
+"""Columns of texels at least that "exact" integrates, as it takes arcs for straight within them."""
 LEAST_ROWS = 128
 """Rows of the summed-area table at least; it has a quarter of the map's where that is more, and twice as many
 columns."""
@@ -40,7 +43,9 @@ class SkyTables:
     total: np.ndarray
     """Integrals of l L over the sphere, float64 [3 axes, 3]."""
     width: int
-    """Columns of texels."""
+    """Columns of texels; "exact" has each of a small map several times."""
+    map_width: int
+    """Columns of nodes of the map."""
 
 
 def sky_tables(pixels: np.ndarray, evaluator: Evaluator) -> SkyTables:
@@ -58,7 +63,8 @@ def sky_tables(pixels: np.ndarray, evaluator: Evaluator) -> SkyTables:
     polar = np.linspace(0.0, math.pi, height + 1)
     areas = row_areas(polar)
     if evaluator == "exact":
-        excess = texels
+        excess = texels = np.repeat(texels, -(-EXACT_COLUMNS // width), axis=1)
+        width = texels.shape[1]
     else:
         solid = (np.cos(polar[:-1]) - np.cos(polar[1:]))[:, None] * (2 * math.pi / width)
         flux = texels @ (0.2126, 0.7152, 0.0722) * solid
@@ -74,7 +80,9 @@ def sky_tables(pixels: np.ndarray, evaluator: Evaluator) -> SkyTables:
         rows = max(LEAST_ROWS, height // 4)
         ends = np.linspace(0.0, math.pi, rows + 1), np.linspace(0.0, 2 * math.pi, 2 * rows + 1)
         table = _summed(texels - excess, polar, areas, *ends).astype(np.float32)
-    return SkyTables(table, areas.astype(np.float32), _bands(columns), sums.astype(np.float32), whole, width)
+    return SkyTables(
+        table, areas.astype(np.float32), _bands(columns), sums.astype(np.float32), whole, width, pixels.shape[1]
+    )
 
 
 def row_areas(polar: np.ndarray) -> np.ndarray:
@@ -145,7 +153,7 @@ def polygon_sky(
     tables, arrays = made
     sky.kind = int(SKY_MAP)
     sky.radiance = wp.vec3(environment.scale, environment.scale, environment.scale)
-    sky.sky_from_world = wp.mat33(*(_own_space(tables.width) @ environment.world_from_environment.T).ravel())
+    sky.sky_from_world = wp.mat33(*(_own_space(tables.map_width) @ environment.world_from_environment.T).ravel())
     mean = environment.mean_radiance / environment.scale
     sky.tolerance = tolerance * math.pi * float(mean @ (0.2126, 0.7152, 0.0722))
     sky.rows, sky.columns = max(tables.table.shape[0] - 1, 0), max(tables.table.shape[1] - 1, 0)

@@ -10,6 +10,7 @@ TECHNIQUE = Technique(
             "estimator",
             {
                 "": Claim(unbiased=False, bound=0.01),
+                "unbiased": Claim({"mode": "unbiased", "flagged_above": 1.0}),
                 "exact": Claim({"evaluator": "exact"}, unbiased=False, bound=0.01),
             },
         )
