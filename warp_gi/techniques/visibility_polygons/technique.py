@@ -17,5 +17,6 @@ TECHNIQUE = Technique(
     },
     presets={"polygons": {"environment": "VisibilityPolygons"}},
     bake_tool="bake_tool",
+    suite="polygons",
     page="techniques/visibility_polygons.md",
 )
