@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -56,33 +57,40 @@ def sky_tables(pixels: np.ndarray, evaluator: Evaluator) -> SkyTables:
         evaluator: "exact" keeps all columns of texels, "adaptive" those with bright ones, and a summed-area table of
             the rest.
     """
-    nodes = pixels.astype(np.float64)
-    nodes = 0.5 * (nodes[:-1] + nodes[1:])
-    texels = 0.5 * (nodes + np.roll(nodes, -1, axis=1))
+    nodes = pixels[:-1].astype(np.float64)
+    nodes += pixels[1:]
+    texels = np.roll(nodes, -1, axis=1)
+    texels += nodes
+    texels *= 0.25
     height, width = texels.shape[:2]
     polar = np.linspace(0.0, math.pi, height + 1)
     areas = row_areas(polar)
     if evaluator == "exact":
-        excess = texels = np.repeat(texels, -(-EXACT_COLUMNS // width), axis=1)
+        texels = np.repeat(texels, -(-EXACT_COLUMNS // width), axis=1)
         width = texels.shape[1]
+    whole = _total(texels, areas)
+    if evaluator == "exact":
+        columns = np.arange(width)
+        excess = texels
     else:
         solid = (np.cos(polar[:-1]) - np.cos(polar[1:]))[:, None] * (2 * math.pi / width)
-        flux = texels @ (0.2126, 0.7152, 0.0722) * solid
+        flux = texels @ np.array((0.2126, 0.7152, 0.0722))
+        flux *= solid
         most = max(BRIGHT, BRIGHT_MEANS / flux.size) * flux.sum()
-        excess = texels * np.maximum(1.0 - most / np.maximum(flux, 1e-300), 0.0)[:, :, None]
-    columns = np.flatnonzero(excess.any(axis=(0, 2)))
-    sums = np.zeros((len(columns), height + 1, 2, 3))
-    parts = excess[:, columns, None, :] * np.diff(areas, axis=0)[:, None, :, None]
-    sums[:, 1:] = np.cumsum(parts, axis=0).transpose(1, 0, 2, 3)
-    whole = _summed(texels, polar, areas, np.array([math.pi]), np.array([2 * math.pi]))[0, 0]
+        bright = flux > most
+        columns = np.flatnonzero(bright.any(axis=0))
+        share = np.maximum(1.0 - most / np.maximum(flux[:, columns], 1e-300), 0.0)
+        excess = texels[:, columns] * share[:, :, None]
+        texels[:, columns] -= excess
+    sums = np.zeros((len(columns), height + 1, 2, 3), np.float32)
+    for k in range(2):
+        sums[:, 1:, k] = np.cumsum(excess * np.diff(areas[:, k])[:, None, None], axis=0).transpose(1, 0, 2)
     table = np.zeros((0, 0, 3, 3), np.float32)
     if evaluator == "adaptive":
         rows = max(LEAST_ROWS, height // 4)
         ends = np.linspace(0.0, math.pi, rows + 1), np.linspace(0.0, 2 * math.pi, 2 * rows + 1)
-        table = _summed(texels - excess, polar, areas, *ends).astype(np.float32)
-    return SkyTables(
-        table, areas.astype(np.float32), _bands(columns), sums.astype(np.float32), whole, width, pixels.shape[1]
-    )
+        table = _summed(texels, polar, areas, *ends).astype(np.float32)
+    return SkyTables(table, areas.astype(np.float32), _bands(columns), sums, whole, width, pixels.shape[1])
 
 
 def row_areas(polar: np.ndarray) -> np.ndarray:
@@ -111,20 +119,34 @@ def _summed(
     row = np.minimum((rows / math.pi * height).astype(int), height - 1)
     by_row = []
     for k in range(2):
-        below = np.concatenate(
-            [np.zeros((1, width, 3)), np.cumsum(texels * np.diff(areas[:, k])[:, None, None], axis=0)]
-        )
-        by_row.append(below[row] + texels[row] * (row_areas(rows)[:, k] - areas[row, k])[:, None, None])
+        parts = texels * np.diff(areas[:, k])[:, None, None]
+        below = np.zeros((len(rows), width, 3))
+        for at in range(1, len(rows)):
+            below[at] = below[at - 1]
+            if row[at] > row[at - 1]:
+                below[at] += parts[row[at - 1] : row[at]].sum(axis=0)
+        by_row.append(below + texels[row] * (row_areas(rows)[:, k] - areas[row, k])[:, None, None])
     azimuths = np.linspace(0.0, 2 * math.pi, width + 1)
     column = np.minimum((columns / (2 * math.pi) * width).astype(int), width - 1)
     result = np.zeros((len(rows), len(columns), 3, 3))
-    measures = (lambda p: -np.cos(p), lambda p: p, lambda p: -np.sin(p))
-    for axis, (measure, values) in enumerate(zip(measures, (by_row[0], by_row[1], by_row[0]), strict=True)):
+    for axis, (measure, values) in enumerate(zip(_ACROSS, (by_row[0], by_row[1], by_row[0]), strict=True)):
         steps = values * np.diff(measure(azimuths))[None, :, None]
         below = np.concatenate([np.zeros((len(rows), 1, 3)), np.cumsum(steps, axis=1)], axis=1)
         rest = (measure(columns) - measure(azimuths[column]))[None, :, None]
         result[:, :, axis] = below[:, column] + values[:, column] * rest
     return result
+
+
+def _total(texels: np.ndarray, areas: np.ndarray) -> np.ndarray:
+    """Return integrals of l L over the sphere, float64 [3 axes, 3]."""
+    height, width = texels.shape[:2]
+    by_column = (np.diff(areas, axis=0).T @ texels.reshape(height, -1)).reshape(2, width, 3)
+    azimuths = np.linspace(0.0, 2 * math.pi, width + 1)
+    return np.stack([np.diff(measure(azimuths)) @ by_column[k] for measure, k in zip(_ACROSS, (0, 1, 0), strict=True)])
+
+
+_ACROSS: tuple[Callable[[np.ndarray], np.ndarray], ...] = (lambda p: -np.cos(p), lambda p: p, lambda p: -np.sin(p))
+"""Antiderivatives over the azimuth of what x, y and z of a direction have of it."""
 
 
 def polygon_sky(
