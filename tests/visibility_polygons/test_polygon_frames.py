@@ -102,6 +102,18 @@ def test_unbiased_is_the_traced_mean_with_less_noise(material, environment):
     assert np.mean((mean - truth) ** 2) < np.mean((biased - truth) ** 2)
 
 
+def test_three_integrals_a_pixel_are_the_method_before():
+    """Light of three corners, blended: noise-free, near the truth, and one integral is nearer on the whole."""
+    scene = stage(level=3)
+    truth = light(scene, gi.TracedEnvironment(), 1024)
+    bake = gi.bake(scene, POLYGONS, device().alias)
+    one, three = (light(scene, replace(POLYGONS, evaluations=count), 64, [bake]) for count in (1, 3))
+    errors = [np.abs(image - truth).mean(axis=2)[truth.any(axis=2)] / truth.mean() for image in (one, three)]
+    assert abs((three - truth).mean() / truth.mean()) < 0.01 and np.median(errors[1]) < 0.02
+    assert 0 < np.median(errors[0]) < np.median(errors[1])
+    assert np.mean(errors[0] ** 2) < np.mean(errors[1] ** 2)
+
+
 def test_a_turning_sky_needs_no_new_bake_and_no_new_table():
     scene = stage()
     bake = gi.bake(scene, POLYGONS, device().alias)
@@ -141,6 +153,8 @@ def test_what_moves_is_refused():
 @pytest.mark.parametrize(
     ("settings", "told"),
     [
+        ({"evaluations": 2}, "evaluations must be 1 or 3, got 2"),
+        ({"evaluations": 3, "mode": "unbiased"}, "corrects one integral a pixel, not 3"),
         ({"mode": "biased"}, "unknown mode of visibility polygons 'biased'"),
         ({"evaluator": "vsat"}, "unknown evaluator of visibility polygons 'vsat'"),
         ({"resolution": 4}, "resolution must be a whole number from 8 to 256, got 4"),

@@ -24,7 +24,7 @@ COLUMNS = columns(
     measured(TIME, "s", "lower", "tables cpu s"),
     measured(ERROR, "% of the mean irradiance", "lower", "rms %", "p99 %", "max %"),
     # frames
-    measured(ERROR, "% of the mean", "lower", "median %", "p95 %"),
+    measured(ERROR, "% of the mean", "lower", "median %", "p95 %", "noise %"),
     measured(ERROR, "% of the mean", None, "mean %"),
     measured(ERROR, "dB", "higher", "PSNR"),
     measured(RATIO, "times", "lower", "time over traced 256"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -39,12 +40,20 @@ def _rows(name: str, scene: gi.Scene, quick: bool, device: str, gallery: Gallery
     reference_spp = QUICK_REFERENCE if quick else REFERENCE
     polygons, traced = gi.VisibilityPolygons(resolution=16 if quick else 64), gi.TracedEnvironment()
     bake = timed_bake(scene, polygons, device)[0]
-    unbiased = gi.VisibilityPolygons(resolution=polygons.resolution, mode="unbiased")
-    contenders: dict[tuple[str, int], Stage] = {}
-    for spp in QUICK_SPP if quick else SPP:
-        contenders["polygons", spp] = Stage(scene, camera, polygons, spp, device, bake)
-        contenders["unbiased", spp] = Stage(scene, camera, unbiased, spp, device, bake)
-        contenders["traced", spp] = Stage(scene, camera, traced, spp, device)
+    kinds: dict[str, tuple[gi.Estimator, gi.Bake | None]] = {
+        "polygons": (polygons, bake),
+        "three evaluations": (replace(polygons, evaluations=3), bake),
+        "unbiased": (replace(polygons, mode="unbiased"), bake),
+        "traced": (traced, None),
+    }
+    contenders, again = (
+        {
+            (kind, spp): Stage(scene, camera, estimator, spp, device, known, seed)
+            for spp in (QUICK_SPP if quick else SPP)
+            for kind, (estimator, known) in kinds.items()
+        }
+        for seed in (0, SEED + 1)
+    )
     truth = Stage(scene, camera, traced, reference_spp, device, seed=SEED)
     named = {f"{kind}, {spp}": stage for (kind, spp), stage in contenders.items()}
     taken = race(named, QUICK_TURNS if quick else TURNS, device)
@@ -53,8 +62,15 @@ def _rows(name: str, scene: gi.Scene, quick: bool, device: str, gallery: Gallery
     rows: list[Row] = []
     for (kind, spp), stage in contenders.items():
         cost = taken[f"{kind}, {spp}"]
-        row: Row = {"table": "frames", "scene": name, "renderer": kind, "spp": spp, "pixels": f"{surface.size}"}
+        row: Row = {
+            "table": "frames",
+            "scene": name,
+            "renderer": kind,
+            "spp": spp,
+            "pixels": f"{surface.shape[1]}x{surface.shape[0]}",
+        }
         row |= {"reference spp": reference_spp} | cost.row() | errors_of(stage.picture[surface], truth.picture[surface])
+        row["noise %"] = errors_of(stage.picture[surface], again[kind, spp].picture[surface])["rms %"] / 2**0.5
         rows.append(row if quick else row | {"time over traced 256": cost.cost / slowest})
     images = {key: stage.picture for key, stage in named.items()}
     gallery.add(PictureSet(f"{name} under the city's sky", truth.picture, images))

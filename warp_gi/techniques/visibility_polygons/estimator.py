@@ -14,6 +14,7 @@ import warp as wp
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.kernels import visibility_polygons as kernels
+from warp_gi.kernels import visibility_polygons_corners as corner_kernels
 from warp_gi.kernels import visibility_polygons_shade as shade_kernels
 from warp_gi.kernels import visibility_polygons_trace as trace_kernels
 from warp_gi.kernels import visibility_polygons_unbiased as unbiased_kernels
@@ -67,6 +68,9 @@ class VisibilityPolygons(Estimator):
     mode: Literal["interpolated", "unbiased"] = "interpolated"
     """What is made of the light through polygons: "interpolated" takes it as it is; "unbiased" corrects it by samples
     of the sky, of which it is the control variate, with much less noise than theirs."""
+    evaluations: Literal[1, 3] = 1
+    """Integrals a pixel: 1 of what the corners of its triangle see, blended; 3, as was done before, of what each of
+    them sees, moved to the pixel, whose light is blended: slower, and mostly less true. For comparison."""
     evaluator: Literal["adaptive", "exact"] = "adaptive"
     """How the sky is integrated: "adaptive" takes bright texels exactly and the rest from a summed-area table, halving
     edges where that is not enough; "exact" integrates over all texels, and takes several times as long."""
@@ -87,6 +91,10 @@ class VisibilityPolygons(Estimator):
             raise unknown_name("evaluator of visibility polygons", self.evaluator, ("adaptive", "exact"))
         if self.mode not in ("interpolated", "unbiased"):
             raise unknown_name("mode of visibility polygons", self.mode, ("interpolated", "unbiased"))
+        if self.evaluations not in (1, 3) or isinstance(self.evaluations, bool):
+            raise OptionError(f"evaluations must be 1 or 3, got {self.evaluations!r}")
+        if self.evaluations == 3 and self.mode == "unbiased":
+            raise OptionError('mode "unbiased" corrects one integral a pixel, not 3: take evaluations 1')
         size = self.resolution
         if isinstance(size, bool) or not isinstance(size, int) or not 8 <= size <= 256:
             raise OptionError(f"resolution must be a whole number from 8 to 256, got {size!r}")
@@ -141,10 +149,14 @@ class VisibilityPolygons(Estimator):
 
     def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
         """Return the kernels of light through polygons, and of traced light."""
-        known = (shade_kernels.shade_polygons, trace_kernels.trace_polygons)
+        known = (self._shading, trace_kernels.trace_polygons)
         if self.mode == "unbiased":
             return (*known, unbiased_kernels.correct_polygons, unbiased_kernels.trace_unbiased)
         return known
+
+    @property
+    def _shading(self) -> wp.Kernel:
+        return corner_kernels.shade_corners if self.evaluations == 3 else shade_kernels.shade_polygons
 
     def trace(self, frame: Frame, state: PolygonState) -> None:
         """Add the light of the current camera sample."""
@@ -162,7 +174,7 @@ class VisibilityPolygons(Estimator):
         buffers.moment1, buffers.moment2 = frame.moments("environment")
         buffers.known = wp.empty(buffers.width * buffers.height, dtype=wp.vec3, device=frame.device)
         inputs = [frame.data, frame.pass_settings, state.sets, state.lists, sky, frame.hits, buffers]
-        frame.launch_tiled(shade_kernels.shade_polygons, inputs)
+        frame.launch_tiled(self._shading, inputs)
         frame.launch_tiled(
             trace_kernels.trace_polygons, [frame.data, frame.pass_settings, state.lists, frame.hits, buffers]
         )
