@@ -44,7 +44,9 @@ def test_bakes_have_the_sizes_of_their_arrays():
 def test_evaluators_agree_with_each_other_and_with_the_closed_form():
     rows = suite.evaluator_rows(True, "cpu")
     assert COLUMNS.undeclared(rows) == []
-    (adaptive, exact), white = rows[:2], rows[2:]
+    (adaptive, exact, paper, steep), white = rows[:4], rows[4:]
+    assert max(steep["rms %"], paper["rms %"]) < 5
+    assert adaptive["rms %"] < min(steep["rms %"], paper["rms %"])
     assert adaptive["turns"] == exact["turns"] == suite.QUICK_TURNS
     assert 0 < adaptive["rms %"] < 0.2 and adaptive["max %"] < 1 and "rms %" not in exact
     assert adaptive["us a polygon"] > 0 and exact["tables cpu s"] > 0
@@ -60,7 +62,7 @@ def test_a_triangle_has_the_light_of_its_closed_form():
     octant = [np.eye(3)]
     assert suite.closed_form(octant, np.array([0.0, 1.0, 0.0])) == pytest.approx(np.pi / 4)
     sky = suite.gi.Environment.constant(1.0)
-    found, _ = suite.integrated(sky, "adaptive", [octant], np.array([[0.0, 1.0, 0.0]]), launch.get_device("cpu"))
+    found, _ = suite.integrated(sky, "adaptive", 0.0, [octant], np.array([[0.0, 1.0, 0.0]]), launch.get_device("cpu"))
     np.testing.assert_allclose(found, np.pi / 4, rtol=1e-5)
 
 

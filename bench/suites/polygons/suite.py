@@ -22,6 +22,7 @@ from warp_gi.bench.suites.polygons.frames import frame_rows
 from warp_gi.bench.suites.polygons.shapes import STAND_INS, StandIn, bumpy
 from warp_gi.bench.suites.transfer.views import sky_missing, true_sky
 from warp_gi.kernels import visibility_polygons_sky as kernels
+from warp_gi.kernels import visibility_polygons_vsat as vsat_kernels
 from warp_gi.techniques.visibility_polygons.sky import EVALUATORS, Evaluator, polygon_sky, sky_tables
 
 TOLERANCE = gi.VisibilityPolygons().tolerance
@@ -29,6 +30,13 @@ POLYGONS, QUICK_POLYGONS = 64, 8
 TURNS, QUICK_TURNS = 72, 4
 SKIES, QUICK_SKIES = ("city", "forest", "courtyard"), ("city",)
 WHITE_POLYGONS, QUICK_WHITE_POLYGONS = 3000, 100
+EVALUATED: dict[str, tuple[Evaluator, float]] = {
+    "adaptive": ("adaptive", 0.0),
+    "exact": ("exact", 0.0),
+    "vsat, 5.8": ("vsat", 5.8),
+    "vsat, 163": ("vsat", 163.0),
+}
+"""Evaluators by their names in rows; the paper's has the slope of its sigmoid, its own and that of the least errors."""
 LISTS = ("corner_sets", "states", "list_starts", "list_contours", "list_first", "step_starts", "steps", "errors")
 """Arrays of a bake that are of triangles; the others are of vertices."""
 
@@ -107,20 +115,20 @@ def sweep_rows(
     """Return a row for each evaluator, with errors in percent of the sky's mean irradiance against "exact"."""
     sky = true_sky(name)
     mean = np.pi * float(sky.mean_radiance.mean())
-    light: dict[str, list[np.ndarray]] = {one: [] for one in EVALUATORS}
-    seconds: dict[str, list[float]] = {one: [] for one in EVALUATORS}
+    light: dict[str, list[np.ndarray]] = {one: [] for one in EVALUATED}
+    seconds: dict[str, list[float]] = {one: [] for one in EVALUATED}
     for turn in turns:
-        for one in EVALUATORS:
-            found, cost = integrated(sky.rotated(float(turn)), one, polygons, normals, device)
+        for one, method in EVALUATED.items():
+            found, cost = integrated(sky.rotated(float(turn)), *method, polygons, normals, device)
             light[one].append(found.mean(axis=1))
             seconds[one].append(cost)
     rows: list[Row] = []
-    for one in EVALUATORS:
+    for one, (evaluator, _) in EVALUATED.items():
         row: Row = {"table": "evaluators", "sky": name, "evaluator": one, "polygons": len(polygons)}
         row |= {"turns": len(turns), "us a polygon": 1e6 * float(np.median(seconds[one])) / len(polygons)}
         begun = time.process_time()
         assert sky.pixels is not None
-        sky_tables(sky.pixels, one)
+        sky_tables(sky.pixels, evaluator)
         row["tables cpu s"] = time.process_time() - begun
         if one != "exact":
             row |= spread_of(100 * (np.array(light[one]) - np.array(light["exact"])) / mean)
@@ -139,7 +147,12 @@ def spread_of(error: np.ndarray) -> dict[str, Any]:
 
 
 def integrated(
-    sky: gi.Environment, evaluator: Evaluator, polygons: list[list[np.ndarray]], normals: np.ndarray, device: wp.Device
+    sky: gi.Environment,
+    evaluator: Evaluator,
+    slope: float,
+    polygons: list[list[np.ndarray]],
+    normals: np.ndarray,
+    device: wp.Device,
 ) -> tuple[np.ndarray, float]:
     """Return irradiance through polygons of directions in world space, float64 [polygon, 3], and its seconds."""
     tables = polygon_sky(sky, evaluator, TOLERANCE, device)
@@ -152,9 +165,10 @@ def integrated(
     plain.points = launch.on_device((np.concatenate(contours) @ turn.T).astype(np.float32), wp.vec3, device)
     plain.normals = launch.on_device((normals @ turn.T).astype(np.float32), wp.vec3, device)
     plain.light = wp.zeros(len(polygons), dtype=wp.vec3, device=device)
-    _, (_, cpu), on_device = clocked(
-        lambda: launch.launch(kernels.integrate_polygons, len(polygons), [tables, plain], device), device.alias
-    )
+    kernel, inputs = kernels.integrate_polygons, [tables, plain]
+    if evaluator == "vsat":
+        kernel, inputs = vsat_kernels.integrate_vsat, [tables, slope, plain]
+    _, (_, cpu), on_device = clocked(lambda: launch.launch(kernel, len(polygons), inputs, device), device.alias)
     return plain.light.numpy().astype(np.float64), cpu if on_device is None else on_device
 
 
@@ -166,7 +180,7 @@ def white_rows(count: int, device: wp.Device) -> list[Row]:
         polygons, normals = bitten(count, walls)
         truth = np.array([closed_form(*one) for one in zip(polygons, normals, strict=True)])
         for one in EVALUATORS:
-            found, _ = integrated(sky, one, polygons, normals, device)
+            found, _ = integrated(sky, one, 0.0, polygons, normals, device)
             row: Row = {"table": "white sky", "walls": walls, "evaluator": one, "polygons": count}
             rows.append(row | spread_of(100 * (found[:, 0] - truth) / np.pi))
     return rows

@@ -14,8 +14,10 @@ from warp_gi.kernels.visibility_polygons_sky import SKY_CONSTANT, SKY_MAP, SKY_N
 from warp_gi.launch import on_device
 from warp_gi.scene.environment import Environment
 
-Evaluator = Literal["adaptive", "exact"]
+Evaluator = Literal["adaptive", "exact", "vsat"]
+"""How the sky is integrated; "vsat" is the paper's way, which is measured and not used."""
 EVALUATORS: tuple[Evaluator, ...] = ("adaptive", "exact")
+"""Those of frames."""
 BRIGHT, BRIGHT_MEANS = 1e-3, 8.0
 """Share of the sky's flux above which a texel's excess is integrated exactly, in a band of columns; in means of texels,
 if that is more."""
@@ -55,7 +57,7 @@ def sky_tables(pixels: np.ndarray, evaluator: Evaluator) -> SkyTables:
     Args:
         pixels: The map, float32 [height, width, 3].
         evaluator: "exact" keeps all columns of texels, "adaptive" those with bright ones, and a summed-area table of
-            the rest.
+            the rest; "vsat" has a table of all, of a cell a texel.
     """
     nodes = pixels[:-1].astype(np.float64)
     nodes += pixels[1:]
@@ -72,6 +74,9 @@ def sky_tables(pixels: np.ndarray, evaluator: Evaluator) -> SkyTables:
     if evaluator == "exact":
         columns = np.arange(width)
         excess = texels
+    elif evaluator == "vsat":
+        columns = np.zeros(0, np.int64)
+        excess = texels[:, :0]
     else:
         solid = (np.cos(polar[:-1]) - np.cos(polar[1:]))[:, None] * (2 * math.pi / width)
         flux = texels @ np.array((0.2126, 0.7152, 0.0722))
@@ -86,9 +91,10 @@ def sky_tables(pixels: np.ndarray, evaluator: Evaluator) -> SkyTables:
     for k in range(2):
         sums[:, 1:, k] = np.cumsum(excess * np.diff(areas[:, k])[:, None, None], axis=0).transpose(1, 0, 2)
     table = np.zeros((0, 0, 3, 3), np.float32)
-    if evaluator == "adaptive":
-        rows = max(LEAST_ROWS, height // 4)
-        ends = np.linspace(0.0, math.pi, rows + 1), np.linspace(0.0, 2 * math.pi, 2 * rows + 1)
+    if evaluator != "exact":
+        rows = height if evaluator == "vsat" else max(LEAST_ROWS, height // 4)
+        across = width if evaluator == "vsat" else 2 * rows
+        ends = np.linspace(0.0, math.pi, rows + 1), np.linspace(0.0, 2 * math.pi, across + 1)
         table = _summed(texels, polar, areas, *ends).astype(np.float32)
     return SkyTables(table, areas.astype(np.float32), _bands(columns), sums, whole, width, pixels.shape[1])
 
