@@ -92,6 +92,8 @@ FIELD_SET_DIMENSION = wp.constant(104)  # which set of light samples a pixel tak
 POLYGON_SKY_DIMENSION = wp.constant(105)  # the sky sample; random: its further digits
 POLYGON_DIRECTION_DIMENSION = wp.constant(106)  # the direction by the BSDF
 POLYGON_LOBE_DIMENSION = wp.constant(107)  # and its lobe (1d)
+POLYGON_PATCH_DIMENSION = wp.constant(108)  # the point in the sky sample's patch (random): this one and the one after
+POLYGON_EXACT_DIMENSION = wp.constant(110)  # whether a pixel's light is integrated exactly, too (random)
 
 # Launches of techniques that have no lines here: from this dimension on, up to 999 of them.
 OWN_DIMENSION = wp.constant(3000)

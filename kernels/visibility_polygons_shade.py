@@ -7,14 +7,14 @@ from warp_gi.kernels.gbuffer import PassSettings, PrimaryHits, tiled_pixel
 from warp_gi.kernels.surface import surface_at
 from warp_gi.kernels.types import SceneData
 from warp_gi.kernels.visibility_polygons import MATCHED, PolygonLists, PolygonSets
-from warp_gi.kernels.visibility_polygons_sky import PolygonSky, record_light
+from warp_gi.kernels.visibility_polygons_sky import PolygonSky, not_negative, record_light
 from warp_gi.kernels.visibility_polygons_trace import PolygonBuffers, add_equal, needs_rays, seen_record
 
 wp.set_module_options({"enable_backward": False})
 
 
 # Thread: a pixel. Adds the diffuse light of the current camera sample where polygons know it; where rays add to that,
-# `known` has it instead.
+# `known` has it instead, and is not clamped where their mean has to be right.
 @wp.kernel
 def shade_polygons(
     first: wp.int32,
@@ -43,6 +43,10 @@ def shade_polygons(
     normal = wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
     share = wp.cw_mul(diffuse_share(s.bsdf), s.bsdf.diffuse) / wp.pi
     light = wp.cw_mul(share, record_light(sets, lists, sky, record, wp.vec3(1.0 - u - v, u, v), normal))
+    if buffers.unbiased != 0:
+        buffers.known[pixel] = light
+        return
+    light = not_negative(light)
     if needs_rays(s.bsdf):
         buffers.known[pixel] = light
     else:

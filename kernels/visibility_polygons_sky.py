@@ -251,7 +251,7 @@ def with_edge(sky: PolygonSky, sum: EdgeSum, a: wp.vec3, b: wp.vec3) -> EdgeSum:
 
 
 # n . integral of l L over the polygon, W/m^2. Which of zenith and nadir are inside: `turn` tells one from the other;
-# whether none or both are is looked up.
+# whether none or both are is looked up. May be an error of edges below 0.
 @wp.func
 def polygon_light(sky: PolygonSky, sum: EdgeSum) -> wp.vec3:
     light = sum.light
@@ -262,7 +262,12 @@ def polygon_light(sky: PolygonSky, sum: EdgeSum) -> wp.vec3:
         if inside > 0:
             n = sum.normal
             light = light + sky.total_x * n[0] + sky.total_y * n[1] + sky.total_z * n[2]
-    light = wp.cw_mul(light, sky.radiance)
+    return wp.cw_mul(light, sky.radiance)
+
+
+# Light that may be a rounding below 0, as an edge's error is.
+@wp.func
+def not_negative(light: wp.vec3) -> wp.vec3:
     return wp.vec3(wp.max(light[0], 0.0), wp.max(light[1], 0.0), wp.max(light[2], 0.0))
 
 
@@ -313,4 +318,4 @@ def integrate_polygons(first: wp.int32, sky: PolygonSky, polygons: PlainPolygons
             next = polygons.points[k]
             sum = with_edge(sky, sum, before, next)
             before = next
-    polygons.light[polygon] = polygon_light(sky, sum)
+    polygons.light[polygon] = not_negative(polygon_light(sky, sum))

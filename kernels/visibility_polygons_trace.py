@@ -27,6 +27,7 @@ wp.set_module_options({"enable_backward": False})
 class PolygonBuffers:
     width: wp.int32  # pixels
     height: wp.int32
+    unbiased: wp.int32  # 1: samples correct what polygons are wrong by
     environment: wp.array(dtype=wp.vec3)  # sums over samples, W/(m^2 sr), [height * width]
     moment1: wp.array(dtype=wp.vec3)  # of samples, for the variance buffer
     moment2: wp.array(dtype=wp.vec3)  # of their squares
@@ -116,7 +117,7 @@ def trace_polygons(
     record = seen_record(scene.geometry, face, hits.direction[pixel])
     is_known = lists.states[record] == wp.uint8(MATCHED)
     s = surface_at(scene, face, hits.u[pixel], hits.v[pixel], -hits.direction[pixel])
-    if is_known and not needs_rays(s.bsdf):
+    if is_known and (buffers.unbiased != 0 or not needs_rays(s.bsdf)):
         return
     share = wp.vec3(0.0, 0.0, 0.0)
     lobe = s.bsdf

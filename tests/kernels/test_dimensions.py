@@ -142,6 +142,16 @@ def test_paths_that_measure_reach_do_not_meet():
             (RANDOM, d.FIELD_SET_DIMENSION),
         ],
         [
+            (STRATIFIED, d.CAMERA_DIMENSION),
+            (STRATIFIED, d.POLYGON_SKY_DIMENSION),
+            (RANDOM, d.POLYGON_SKY_DIMENSION),
+            (STRATIFIED, d.POLYGON_DIRECTION_DIMENSION),
+            (STRATIFIED, d.POLYGON_LOBE_DIMENSION),
+            (RANDOM, d.POLYGON_PATCH_DIMENSION),
+            (RANDOM, d.POLYGON_PATCH_DIMENSION + 1),
+            (RANDOM, d.POLYGON_EXACT_DIMENSION),
+        ],
+        [
             (STRATIFIED, d.TRANSFER_DIRECTION_DIMENSION),
             (RANDOM, d.TRANSFER_TURN_DIMENSION),
             (STRATIFIED, d.TRANSFER_LAMP_DIMENSION),
@@ -150,7 +160,7 @@ def test_paths_that_measure_reach_do_not_meet():
             (STRATIFIED, d.TRANSFER_RAY_DIMENSION),
         ],
     ],
-    ids=["visibility bake", "sets", "visibility field", "transfer bake"],
+    ids=["visibility bake", "sets", "visibility field", "visibility polygons", "transfer bake"],
 )
 def test_numbers_of_a_launch_do_not_meet(launch):
     assert all(a != b for a, b in combinations(launch, 2))

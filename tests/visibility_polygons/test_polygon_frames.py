@@ -82,6 +82,38 @@ def test_a_glossy_floor_is_the_traced_one_in_the_mean():
     np.testing.assert_allclose(got.mean(axis=(0, 1)), truth.mean(axis=(0, 1)), rtol=0.015)
 
 
+@pytest.mark.parametrize("material", [GREY, gi.Material("glossy", (0.5, 0.4, 0.3), roughness=0.4)], ids=["", "glossy"])
+@pytest.mark.parametrize("environment", [SKY, gi.Environment(color=(0.5, 1.0, 2.0))], ids=["map", "constant"])
+def test_unbiased_is_the_traced_mean_with_less_noise(material, environment):
+    """Polygons of a coarse bake, none of them flagged, are the control variate of samples."""
+    scene = stage(material, environment)
+    coarse = replace(POLYGONS, resolution=16, simplified=4.0, flagged_above=1.0)
+    bake = gi.bake(scene, coarse, device().alias)
+    truth = light(scene, gi.TracedEnvironment(), 4096)
+    biased = light(scene, coarse, 64, [bake])
+    frames = np.array([light(scene, replace(coarse, mode="unbiased"), 16, [bake], seed) for seed in range(8)])
+    traced = np.array([light(scene, gi.TracedEnvironment(), 16, seed=seed) for seed in range(8)])
+    mean, noise, other = frames.mean(axis=0), frames.var(axis=0, ddof=1).mean(), traced.var(axis=0, ddof=1).mean()
+    assert noise < 0.5 * other
+    assert np.mean((mean - truth) ** 2) < 1.2 * (noise / 8 + other * 16 / 4096)
+    sums = frames.mean(axis=(1, 2))
+    spread = 4 * sums.std(axis=0, ddof=1) / 8**0.5 + 1e-3 * truth.mean(axis=(0, 1))
+    assert (np.abs(sums.mean(axis=0) - truth.mean(axis=(0, 1))) < spread).all()
+    assert np.mean((mean - truth) ** 2) < np.mean((biased - truth) ** 2)
+
+
+def test_three_integrals_a_pixel_are_the_method_before():
+    """Light of three corners, blended: noise-free, near the truth, and one integral is nearer on the whole."""
+    scene = stage(level=3)
+    truth = light(scene, gi.TracedEnvironment(), 1024)
+    bake = gi.bake(scene, POLYGONS, device().alias)
+    one, three = (light(scene, replace(POLYGONS, evaluations=count), 64, [bake]) for count in (1, 3))
+    errors = [np.abs(image - truth).mean(axis=2)[truth.any(axis=2)] / truth.mean() for image in (one, three)]
+    assert abs((three - truth).mean() / truth.mean()) < 0.01 and np.median(errors[1]) < 0.02
+    assert 0 < np.median(errors[0]) < np.median(errors[1])
+    assert np.mean(errors[0] ** 2) < np.mean(errors[1] ** 2)
+
+
 def test_a_turning_sky_needs_no_new_bake_and_no_new_table():
     scene = stage()
     bake = gi.bake(scene, POLYGONS, device().alias)
@@ -121,6 +153,9 @@ def test_what_moves_is_refused():
 @pytest.mark.parametrize(
     ("settings", "told"),
     [
+        ({"evaluations": 2}, "evaluations must be 1 or 3, got 2"),
+        ({"evaluations": 3, "mode": "unbiased"}, "corrects one integral a pixel, not 3"),
+        ({"mode": "biased"}, "unknown mode of visibility polygons 'biased'"),
         ({"evaluator": "vsat"}, "unknown evaluator of visibility polygons 'vsat'"),
         ({"resolution": 4}, "resolution must be a whole number from 8 to 256, got 4"),
         ({"resolution": True}, "resolution must be a whole number from 8 to 256, got True"),

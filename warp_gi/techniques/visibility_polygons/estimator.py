@@ -14,8 +14,10 @@ import warp as wp
 from warp_gi.errors import OptionError, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.kernels import visibility_polygons as kernels
+from warp_gi.kernels import visibility_polygons_corners as corner_kernels
 from warp_gi.kernels import visibility_polygons_shade as shade_kernels
 from warp_gi.kernels import visibility_polygons_trace as trace_kernels
+from warp_gi.kernels import visibility_polygons_unbiased as unbiased_kernels
 from warp_gi.launch import get_device
 from warp_gi.scene.baked import whole_scene
 from warp_gi.techniques.visibility_polygons.bake import (
@@ -27,7 +29,7 @@ from warp_gi.techniques.visibility_polygons.bake import (
     sets_on,
 )
 from warp_gi.techniques.visibility_polygons.settings import PolygonSettings
-from warp_gi.techniques.visibility_polygons.sky import Evaluator, polygon_sky
+from warp_gi.techniques.visibility_polygons.sky import EVALUATORS, polygon_sky
 
 if TYPE_CHECKING:
     from warp_gi.baking import Bake, Setting
@@ -57,12 +59,18 @@ class VisibilityPolygons(Estimator):
     Every vertex keeps what it sees of the sky as polygons in space; over a triangle the polygons of its corners blend,
     point by point, and the sky is integrated along their edges. Shadows of suns are sharp, and the bake knows no sky:
     under one that turns nothing is rebuilt. Triangles over which this was found too wrong are traced, and so are glossy
-    lobes. Biased by what is interpolated, up to ``flagged_above``. For scenes at rest.
+    lobes. Biased by what is interpolated, up to ``flagged_above``, except in the mode "unbiased". For scenes at rest.
     Source: "Visibility correspondence" (visibility_correspondence.txt).
     """
 
     term: ClassVar[str] = "environment"
 
+    mode: Literal["interpolated", "unbiased"] = "interpolated"
+    """What is made of the light through polygons: "interpolated" takes it as it is; "unbiased" corrects it by samples
+    of the sky, of which it is the control variate, with much less noise than theirs."""
+    evaluations: Literal[1, 3] = 1
+    """Integrals a pixel: 1 of what the corners of its triangle see, blended; 3, as was done before, of what each of
+    them sees, moved to the pixel, whose light is blended: slower, and mostly less true. For comparison."""
     evaluator: Literal["adaptive", "exact"] = "adaptive"
     """How the sky is integrated: "adaptive" takes bright texels exactly and the rest from a summed-area table, halving
     edges where that is not enough; "exact" integrates over all texels, and takes several times as long."""
@@ -81,6 +89,12 @@ class VisibilityPolygons(Estimator):
         """Raise OptionError for settings out of range."""
         if self.evaluator not in ("adaptive", "exact"):
             raise unknown_name("evaluator of visibility polygons", self.evaluator, ("adaptive", "exact"))
+        if self.mode not in ("interpolated", "unbiased"):
+            raise unknown_name("mode of visibility polygons", self.mode, ("interpolated", "unbiased"))
+        if self.evaluations not in (1, 3) or isinstance(self.evaluations, bool):
+            raise OptionError(f"evaluations must be 1 or 3, got {self.evaluations!r}")
+        if self.evaluations == 3 and self.mode == "unbiased":
+            raise OptionError('mode "unbiased" corrects one integral a pixel, not 3: take evaluations 1')
         size = self.resolution
         if isinstance(size, bool) or not isinstance(size, int) or not 8 <= size <= 256:
             raise OptionError(f"resolution must be a whole number from 8 to 256, got {size!r}")
@@ -135,22 +149,37 @@ class VisibilityPolygons(Estimator):
 
     def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
         """Return the kernels of light through polygons, and of traced light."""
-        return (shade_kernels.shade_polygons, trace_kernels.trace_polygons)
+        known = (self._shading, trace_kernels.trace_polygons)
+        if self.mode == "unbiased":
+            return (*known, unbiased_kernels.correct_polygons, unbiased_kernels.trace_unbiased)
+        return known
+
+    @property
+    def _shading(self) -> wp.Kernel:
+        return corner_kernels.shade_corners if self.evaluations == 3 else shade_kernels.shade_polygons
 
     def trace(self, frame: Frame, state: PolygonState) -> None:
         """Add the light of the current camera sample."""
         environment = getattr(frame.scene, "environment", None)
         if environment is None or environment.is_black:
             return
-        evaluator: Evaluator = self.evaluator
-        sky = polygon_sky(environment, evaluator, self.tolerance, frame.device)
+        skies = {}
+        for evaluator in EVALUATORS if self.mode == "unbiased" else (self.evaluator,):
+            skies[evaluator] = polygon_sky(environment, evaluator, self.tolerance, frame.device)
+        sky = skies[self.evaluator]
         buffers = trace_kernels.PolygonBuffers()
         buffers.width, buffers.height = frame.camera.resolution
+        buffers.unbiased = int(self.mode == "unbiased")
         buffers.environment = frame["environment"]
         buffers.moment1, buffers.moment2 = frame.moments("environment")
         buffers.known = wp.empty(buffers.width * buffers.height, dtype=wp.vec3, device=frame.device)
         inputs = [frame.data, frame.pass_settings, state.sets, state.lists, sky, frame.hits, buffers]
-        frame.launch_tiled(shade_kernels.shade_polygons, inputs)
+        frame.launch_tiled(self._shading, inputs)
         frame.launch_tiled(
             trace_kernels.trace_polygons, [frame.data, frame.pass_settings, state.lists, frame.hits, buffers]
         )
+        if self.mode == "unbiased":
+            if self.evaluator != "exact":
+                inputs[4] = skies["exact"]
+                frame.launch_tiled(unbiased_kernels.correct_polygons, inputs)
+            frame.launch_tiled(unbiased_kernels.trace_unbiased, inputs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,10 +14,15 @@ from warp_gi.kernels.visibility_polygons_sky import SKY_CONSTANT, SKY_MAP, SKY_N
 from warp_gi.launch import on_device
 from warp_gi.scene.environment import Environment
 
-Evaluator = Literal["adaptive", "exact"]
+Evaluator = Literal["adaptive", "exact", "vsat"]
+"""How the sky is integrated; "vsat" is the paper's way, which is measured and not used."""
+EVALUATORS: tuple[Evaluator, ...] = ("adaptive", "exact")
+"""Those of frames."""
 BRIGHT, BRIGHT_MEANS = 1e-3, 8.0
 """Share of the sky's flux above which a texel's excess is integrated exactly, in a band of columns; in means of texels,
 if that is more."""
+EXACT_COLUMNS = 512
+"""Columns of texels at least that "exact" integrates, as it takes arcs for straight within them."""
 LEAST_ROWS = 128
 """Rows of the summed-area table at least; it has a quarter of the map's where that is more, and twice as many
 columns."""
@@ -40,7 +46,9 @@ class SkyTables:
     total: np.ndarray
     """Integrals of l L over the sphere, float64 [3 axes, 3]."""
     width: int
-    """Columns of texels."""
+    """Columns of texels; "exact" has each of a small map several times."""
+    map_width: int
+    """Columns of nodes of the map."""
 
 
 def sky_tables(pixels: np.ndarray, evaluator: Evaluator) -> SkyTables:
@@ -49,32 +57,46 @@ def sky_tables(pixels: np.ndarray, evaluator: Evaluator) -> SkyTables:
     Args:
         pixels: The map, float32 [height, width, 3].
         evaluator: "exact" keeps all columns of texels, "adaptive" those with bright ones, and a summed-area table of
-            the rest.
+            the rest; "vsat" has a table of all, of a cell a texel.
     """
-    nodes = pixels.astype(np.float64)
-    nodes = 0.5 * (nodes[:-1] + nodes[1:])
-    texels = 0.5 * (nodes + np.roll(nodes, -1, axis=1))
+    nodes = pixels[:-1].astype(np.float64)
+    nodes += pixels[1:]
+    texels = np.roll(nodes, -1, axis=1)
+    texels += nodes
+    texels *= 0.25
     height, width = texels.shape[:2]
     polar = np.linspace(0.0, math.pi, height + 1)
     areas = row_areas(polar)
     if evaluator == "exact":
+        texels = np.repeat(texels, -(-EXACT_COLUMNS // width), axis=1)
+        width = texels.shape[1]
+    whole = _total(texels, areas)
+    if evaluator == "exact":
+        columns = np.arange(width)
         excess = texels
+    elif evaluator == "vsat":
+        columns = np.zeros(0, np.int64)
+        excess = texels[:, :0]
     else:
         solid = (np.cos(polar[:-1]) - np.cos(polar[1:]))[:, None] * (2 * math.pi / width)
-        flux = texels @ (0.2126, 0.7152, 0.0722) * solid
+        flux = texels @ np.array((0.2126, 0.7152, 0.0722))
+        flux *= solid
         most = max(BRIGHT, BRIGHT_MEANS / flux.size) * flux.sum()
-        excess = texels * np.maximum(1.0 - most / np.maximum(flux, 1e-300), 0.0)[:, :, None]
-    columns = np.flatnonzero(excess.any(axis=(0, 2)))
-    sums = np.zeros((len(columns), height + 1, 2, 3))
-    parts = excess[:, columns, None, :] * np.diff(areas, axis=0)[:, None, :, None]
-    sums[:, 1:] = np.cumsum(parts, axis=0).transpose(1, 0, 2, 3)
-    whole = _summed(texels, polar, areas, np.array([math.pi]), np.array([2 * math.pi]))[0, 0]
+        bright = flux > most
+        columns = np.flatnonzero(bright.any(axis=0))
+        share = np.maximum(1.0 - most / np.maximum(flux[:, columns], 1e-300), 0.0)
+        excess = texels[:, columns] * share[:, :, None]
+        texels[:, columns] -= excess
+    sums = np.zeros((len(columns), height + 1, 2, 3), np.float32)
+    for k in range(2):
+        sums[:, 1:, k] = np.cumsum(excess * np.diff(areas[:, k])[:, None, None], axis=0).transpose(1, 0, 2)
     table = np.zeros((0, 0, 3, 3), np.float32)
-    if evaluator == "adaptive":
-        rows = max(LEAST_ROWS, height // 4)
-        ends = np.linspace(0.0, math.pi, rows + 1), np.linspace(0.0, 2 * math.pi, 2 * rows + 1)
-        table = _summed(texels - excess, polar, areas, *ends).astype(np.float32)
-    return SkyTables(table, areas.astype(np.float32), _bands(columns), sums.astype(np.float32), whole, width)
+    if evaluator != "exact":
+        rows = height if evaluator == "vsat" else max(LEAST_ROWS, height // 4)
+        across = width if evaluator == "vsat" else 2 * rows
+        ends = np.linspace(0.0, math.pi, rows + 1), np.linspace(0.0, 2 * math.pi, across + 1)
+        table = _summed(texels, polar, areas, *ends).astype(np.float32)
+    return SkyTables(table, areas.astype(np.float32), _bands(columns), sums, whole, width, pixels.shape[1])
 
 
 def row_areas(polar: np.ndarray) -> np.ndarray:
@@ -103,20 +125,34 @@ def _summed(
     row = np.minimum((rows / math.pi * height).astype(int), height - 1)
     by_row = []
     for k in range(2):
-        below = np.concatenate(
-            [np.zeros((1, width, 3)), np.cumsum(texels * np.diff(areas[:, k])[:, None, None], axis=0)]
-        )
-        by_row.append(below[row] + texels[row] * (row_areas(rows)[:, k] - areas[row, k])[:, None, None])
+        parts = texels * np.diff(areas[:, k])[:, None, None]
+        below = np.zeros((len(rows), width, 3))
+        for at in range(1, len(rows)):
+            below[at] = below[at - 1]
+            if row[at] > row[at - 1]:
+                below[at] += parts[row[at - 1] : row[at]].sum(axis=0)
+        by_row.append(below + texels[row] * (row_areas(rows)[:, k] - areas[row, k])[:, None, None])
     azimuths = np.linspace(0.0, 2 * math.pi, width + 1)
     column = np.minimum((columns / (2 * math.pi) * width).astype(int), width - 1)
     result = np.zeros((len(rows), len(columns), 3, 3))
-    measures = (lambda p: -np.cos(p), lambda p: p, lambda p: -np.sin(p))
-    for axis, (measure, values) in enumerate(zip(measures, (by_row[0], by_row[1], by_row[0]), strict=True)):
+    for axis, (measure, values) in enumerate(zip(_ACROSS, (by_row[0], by_row[1], by_row[0]), strict=True)):
         steps = values * np.diff(measure(azimuths))[None, :, None]
         below = np.concatenate([np.zeros((len(rows), 1, 3)), np.cumsum(steps, axis=1)], axis=1)
         rest = (measure(columns) - measure(azimuths[column]))[None, :, None]
         result[:, :, axis] = below[:, column] + values[:, column] * rest
     return result
+
+
+def _total(texels: np.ndarray, areas: np.ndarray) -> np.ndarray:
+    """Return integrals of l L over the sphere, float64 [3 axes, 3]."""
+    height, width = texels.shape[:2]
+    by_column = (np.diff(areas, axis=0).T @ texels.reshape(height, -1)).reshape(2, width, 3)
+    azimuths = np.linspace(0.0, 2 * math.pi, width + 1)
+    return np.stack([np.diff(measure(azimuths)) @ by_column[k] for measure, k in zip(_ACROSS, (0, 1, 0), strict=True)])
+
+
+_ACROSS: tuple[Callable[[np.ndarray], np.ndarray], ...] = (lambda p: -np.cos(p), lambda p: p, lambda p: -np.sin(p))
+"""Antiderivatives over the azimuth of what x, y and z of a direction have of it."""
 
 
 def polygon_sky(
@@ -145,7 +181,7 @@ def polygon_sky(
     tables, arrays = made
     sky.kind = int(SKY_MAP)
     sky.radiance = wp.vec3(environment.scale, environment.scale, environment.scale)
-    sky.sky_from_world = wp.mat33(*(_own_space(tables.width) @ environment.world_from_environment.T).ravel())
+    sky.sky_from_world = wp.mat33(*(_own_space(tables.map_width) @ environment.world_from_environment.T).ravel())
     mean = environment.mean_radiance / environment.scale
     sky.tolerance = tolerance * math.pi * float(mean @ (0.2126, 0.7152, 0.0722))
     sky.rows, sky.columns = max(tables.table.shape[0] - 1, 0), max(tables.table.shape[1] - 1, 0)

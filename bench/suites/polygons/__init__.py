@@ -1,0 +1,1 @@
+"""The suite ``polygons``: bakes, evaluators and frames of visibility polygons."""
