@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from warp_gi.scene.scene import Scene
 
-
-def contents(scene: Scene) -> tuple[Any, ...]:
+def contents(scene: Any) -> tuple[Any, ...]:
     """Return what makes a scene: its arguments, and its offset. Device buffers are made anew from it."""
     sky = scene.sky_at or scene.environment
     given = scene.nodes, scene.lights, sky, scene.cameras, scene.name, scene.camera_nodes
     return type(scene), given, scene.offset
 
 
-def made(kind: type[Scene], given: tuple[Any, ...], offset: np.ndarray) -> Scene:
+def made(kind: type, given: tuple[Any, ...], offset: np.ndarray) -> Any:
     """Return a scene of ``contents``."""
     scene = kind(*given)
     scene.offset = offset
     return scene
 
 
-def description(scene: Scene) -> str:
+def description(scene: Any) -> str:
     """Return a line that says what a scene holds."""
     low, high = scene.bounds.astype(np.float64)
     size = " x ".join(f"{side:.3g}" for side in high - low)
