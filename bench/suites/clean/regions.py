@@ -83,8 +83,8 @@ _CLEAN = Region(
         Text(
             "Frame 23 of 48. FLIP is against a reference whose own halves differ as told; where these differ by more "
             "than 0.05 it is cleaned by OIDN, as are the halves of the next column. The mean is of frames 0, 23 and "
-            '47, and of the first. "Not averaged" is `denoise.blend` 1. How much more alike errors on flat walls are two '
-            "pixels apart than one, which is 1 for a grid, 0 for noise and below it for what is smooth: {pattern}.",
+            '47, and of the first. "Not averaged" is `denoise.blend` 1. How much more alike errors on flat walls are '
+            "two pixels apart than one, which is 1 for a grid, 0 for noise and below it for what is smooth: {pattern}.",
             {"pattern": Figure("pattern", {"renderer": CLEAN}, at_most="most pattern")},
             SEQUENCES,
         ),
