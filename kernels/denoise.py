@@ -285,8 +285,8 @@ def find_changes(first: wp.int32, settings: DenoiseSettings, noisy: Signals, his
             length = history.length[i]
             fresh = noisy.length[i]
             counts = wp.vec2(
-                wp.where(length[0] >= settings.settled and fresh[0] > 0.0, 1.0, 0.0),
-                wp.where(length[1] >= settings.settled and fresh[1] > 0.0, 1.0, 0.0),
+                wp.where(length[0] >= 1.0 and fresh[0] > 0.0, 1.0, 0.0),
+                wp.where(length[1] >= 1.0 and fresh[1] > 0.0, 1.0, 0.0),
             )
             if counts[0] + counts[1] > 0.0:
                 new = wp.vec2(luminance(noisy.diffuse[i]), luminance(noisy.glossy[i]))

@@ -62,7 +62,7 @@ class SpatioTemporal(Denoiser):
     """Factor of 1 - the cosine between two pixels' normals in the exponent of their weight."""
     plane_distance: float = 1.0
     """Distance to a pixel's tangent plane that makes a weight 1/e, in widths of a pixel there."""
-    lag: float = 3.0
+    lag: float = 2.0
     """Standard deviations by which the light of a block of 8x8 pixels has changed when earlier frames begin to be
     forgotten; at twice as many all are. 0 never forgets."""
 
