@@ -131,6 +131,20 @@ def test_coloured_glass_tints_what_is_behind(tmp_path):
     np.testing.assert_allclose(picture(scene).numpy("emission")[12, 16], [0.1, 1.0, 0.4], rtol=1e-3)
 
 
+@pytest.mark.parametrize("info", [{"texCoord": 1}, {"extensions": {"KHR_texture_transform": {"scale": [0.25, 1]}}}, {}])
+def test_transmission_textures_elsewhere_are_named(tmp_path, info):
+    """They are looked up where the base colour's texture is; nothing is said where that is the same."""
+    glb = square({"pbrMetallicRoughness": {"metallicFactor": 0}}, further=CORNERS[::-1])
+    base, share = (image(glb, np.full((2, 2, 4), 255)) for _ in range(2))
+    glb.json["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"] = {"index": base}
+    extension = {"transmissionFactor": 1.0, "transmissionTexture": {"index": share, **info}}
+    glb.json["materials"][0]["extensions"] = {"KHR_materials_transmission": extension}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        loaded(glb, tmp_path)
+    assert [("coordinates of transmission textures" in str(one.message)) for one in caught] == [True] * bool(info)
+
+
 def test_unlit_with_colors_of_vertices(tmp_path):
     glb = square({"extensions": {"KHR_materials_unlit": {}}})
     colors = glb.accessor(np.tile([0.5, 0.25, 1.0], (4, 1)))

@@ -99,6 +99,8 @@ class MaterialReader:
             alpha_blend=source.get("alphaMode") == "BLEND",
             double_sided=bool(source.get("doubleSided")),
         )
+        if _stands_elsewhere(result.transmission_texture, result.base_color_texture):
+            document.findings.add("coordinates of transmission textures", what)
         if old is not None:
             result = self._converted(result, old, slot, what)
         if document.extension(source, "KHR_materials_unlit", what) is not None:
@@ -293,3 +295,10 @@ def texture_transform(document: Document, info: Part, what: str) -> tuple[int, n
     matrix = np.array([[c * su, s * sv, du], [-s * su, c * sv, dv], [0.0, 0.0, 1.0]])
     own = document.whole(info, "texCoord", what, 0)
     return document.whole(extension, "texCoord", what, own), matrix
+
+
+def _stands_elsewhere(texture: Texture | None, base: Texture | None) -> bool:
+    """Return whether a texture has other coordinates, or repeats otherwise, than that of the base colour."""
+    if texture is None:
+        return False
+    return bool(texture.uv_set) or texture.transform is not None or (base is not None and texture.wrap != base.wrap)

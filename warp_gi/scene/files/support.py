@@ -80,6 +80,7 @@ FEATURES: tuple[Feature, ...] = (
         "approximated",
         ("KHR_materials_pbrSpecularGlossiness", GLTF, "converted to metallic-roughness; pure Lambert without specular"),
         ("KHR_materials_unlit", GLTF, "emits its base colour, reflects nothing, and lights what is around it"),
+        ("coordinates of transmission textures", GLTF, "those of the base colour's texture, which it repeats like"),
         ("a third set of texture coordinates", GLTF, "two sets for the textures of a material"),
         ("KHR_materials_variants", GLTF, "the materials without a variant"),
         (
