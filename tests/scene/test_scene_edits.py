@@ -255,6 +255,21 @@ def test_an_edit_of_the_geometry_before_the_first_frame_is_an_error_too(name):
         next(gi.render(scene, CAMERA, PIPELINE))
 
 
+@pytest.mark.parametrize("edit", ["another texture", "other texels"])
+def test_a_lamp_whose_texture_was_black_when_the_scene_was_made_is_an_error(edit):
+    """It would stay dark: which triangles emit is known then."""
+    black = Texture("black", np.zeros((2, 2, 4), np.uint8))
+    points = np.float32([[-1, 0, 0], [1, 0, 0], [0, 1, 0]])
+    material = Material("lamp", emission=(1.0, 1.0, 1.0), emission_texture=black)
+    scene = gi.Scene([gi.Node("lamp", [gi.Mesh(points, np.int32([[0, 1, 2]]), material)])])
+    if edit == "another texture":
+        scene.materials[0].emission_texture = None
+    else:
+        black.pixels[:] = 255
+    with pytest.raises(SceneError, match="emission of material 'lamp' changed"):
+        next(gi.render(scene, CAMERA, PIPELINE))
+
+
 def test_a_material_that_shines_only_after_the_scene_was_made_is_an_error():
     scene = parts()
     scene.materials[1].emission = (1.0, 1.0, 1.0)

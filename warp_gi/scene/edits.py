@@ -9,6 +9,7 @@ nodes under them, and all lights if one of them moves.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -383,8 +384,13 @@ def _come_or_gone(now: Sequence[Item], old: Sequence[Item]) -> str:
     return f"{(_missing(old, now) or old)[0].name!r} was removed"
 
 
-def _emissions(materials: Iterable[Material]) -> list[list[float]]:
-    return [np.ravel(material.emission).tolist() for material in materials]
+def _emissions(materials: Sequence[Material]) -> list[list[float]]:
+    """Return what decides which triangles emit, by material: factors, and a checksum of the texture."""
+    found = [np.ravel(material.emission).tolist() for material in materials]
+    for material, values in zip(materials, found, strict=True):
+        if any(values) and material.emission_texture is not None:
+            values.append(float(zlib.adler32(np.ascontiguousarray(material.emission_texture.pixels).data)))
+    return found
 
 
 def _first(edits: Iterable[Edit | None]) -> Edit | None:
