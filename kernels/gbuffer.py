@@ -195,6 +195,15 @@ def keep_guides(
         buffers.guide_object[pixel] = object_id + 1
 
 
+# Motion of a point that the ray of a direction shows, in pixels: where it was, minus where it is.
+@wp.func
+def motion_of(
+    camera: CameraData, previous_camera: CameraData, direction: wp.vec3, position: wp.vec3, was: wp.vec3
+) -> wp.vec2:
+    seen = wp.where(camera.spread > 0.0, direction, position - camera.position)
+    return project(previous_camera, was - previous_camera.position) - project(camera, seen)
+
+
 # Sets what is of the first camera sample alone; `face` is -1 where nothing is seen.
 @wp.func
 def keep_place(
@@ -249,8 +258,7 @@ def shade_primary(
         buffers.albedo[pixel] = buffers.albedo[pixel] + s.base_color
         buffers.normal[pixel] = buffers.normal[pixel] + shading_normal(s)
         was = previous_position(scene.geometry, face, u, v)
-        seen = wp.where(camera.spread > 0.0, direction, s.position - camera.position)
-        motion = project(previous_camera, was - previous_camera.position) - project(camera, seen)
+        motion = motion_of(camera, previous_camera, direction, s.position, was)
         position = s.position
         depth = wp.dot(position - camera.position, camera.forward)
         if buffers.guide_object.shape[0] > 0:

@@ -17,6 +17,7 @@ from warp_gi.kernels.gbuffer import (
     camera_origin,
     keep_guides,
     keep_place,
+    motion_of,
     previous_position,
     primary_sample,
     project,
@@ -150,8 +151,7 @@ def shade_layers(
         return
     s = surface_at(scene, r.face, r.u, r.v, -direction)
     was = previous_position(scene.geometry, r.face, r.u, r.v)
-    seen = wp.where(camera.spread > 0.0, direction, s.position - camera.position)
-    motion = project(previous_camera, was - previous_camera.position) - project(camera, seen)
+    motion = motion_of(camera, previous_camera, direction, s.position, was)
     depth = wp.dot(s.position - camera.position, camera.forward)
     keep_place(scene, buffers, settings, pixel, s.position, depth, motion, r.face)
     if buffers.guide_object.shape[0] == 0:

@@ -8,7 +8,7 @@ import warp as wp
 
 from warp_gi.kernels.bsdf import luminance
 from warp_gi.kernels.bvh import coverage, transmitted, triangle_hit
-from warp_gi.kernels.surface import texture_lookup
+from warp_gi.kernels.surface import texture_lookup, triangle_uv
 from warp_gi.kernels.types import Panes, SceneData
 
 wp.set_module_options({"enable_backward": False})
@@ -35,10 +35,7 @@ def pane_color(scene: SceneData, face: wp.int32, u: wp.float32, v: wp.float32) -
     m = scene.materials[scene.geometry.materials[face]]
     color = m.base_color
     if m.base_color_texture >= 0:
-        ids = scene.geometry.indices[face]
-        uvs = scene.geometry.uvs
-        uv = uvs[ids[0]] * (1.0 - u - v) + uvs[ids[1]] * u + uvs[ids[2]] * v
-        texel = texture_lookup(scene, m.base_color_texture, uv)
+        texel = texture_lookup(scene, m.base_color_texture, triangle_uv(scene, face, u, v))
         color = wp.cw_mul(color, wp.vec3(texel[0], texel[1], texel[2]))
     return color / wp.max(luminance(color), 1.0e-9)
 

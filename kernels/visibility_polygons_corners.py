@@ -6,9 +6,8 @@ Each corner of a triangle has its polygons seen from the pixel, by parallax, and
 
 import warp as wp
 
-from warp_gi.kernels.bsdf import diffuse_share
 from warp_gi.kernels.gbuffer import PassSettings, PrimaryHits, tiled_pixel
-from warp_gi.kernels.surface import surface_at
+from warp_gi.kernels.surface import shading_normal, surface_at
 from warp_gi.kernels.types import SceneData
 from warp_gi.kernels.visibility_polygons import (
     MATCHED,
@@ -19,7 +18,7 @@ from warp_gi.kernels.visibility_polygons import (
     synthesized,
 )
 from warp_gi.kernels.visibility_polygons_sky import EdgeSum, PolygonSky, not_negative, polygon_light, with_edge
-from warp_gi.kernels.visibility_polygons_trace import PolygonBuffers, add_equal, needs_rays, seen_record
+from warp_gi.kernels.visibility_polygons_trace import PolygonBuffers, add_equal, diffuse_value, needs_rays, seen_record
 
 wp.set_module_options({"enable_backward": False})
 
@@ -89,8 +88,8 @@ def shade_corners(
     if lists.states[record] != wp.uint8(MATCHED):
         return
     s = surface_at(scene, face, u, v, -hits.direction[pixel])
-    normal = wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
-    share = wp.cw_mul(diffuse_share(s.bsdf), s.bsdf.diffuse) / wp.pi
+    normal = shading_normal(s)
+    share = diffuse_value(s.bsdf)
     light = wp.cw_mul(share, corners_light(sets, lists, sky, record, wp.vec3(1.0 - u - v, u, v), normal))
     if needs_rays(s.bsdf):
         buffers.known[pixel] = light

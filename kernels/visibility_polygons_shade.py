@@ -2,13 +2,12 @@
 
 import warp as wp
 
-from warp_gi.kernels.bsdf import diffuse_share
 from warp_gi.kernels.gbuffer import PassSettings, PrimaryHits, tiled_pixel
-from warp_gi.kernels.surface import surface_at
+from warp_gi.kernels.surface import shading_normal, surface_at
 from warp_gi.kernels.types import SceneData
 from warp_gi.kernels.visibility_polygons import MATCHED, PolygonLists, PolygonSets
 from warp_gi.kernels.visibility_polygons_sky import PolygonSky, not_negative, record_light
-from warp_gi.kernels.visibility_polygons_trace import PolygonBuffers, add_equal, needs_rays, seen_record
+from warp_gi.kernels.visibility_polygons_trace import PolygonBuffers, add_equal, diffuse_value, needs_rays, seen_record
 
 wp.set_module_options({"enable_backward": False})
 
@@ -40,8 +39,8 @@ def shade_polygons(
     if lists.states[record] != wp.uint8(MATCHED):
         return
     s = surface_at(scene, face, u, v, -hits.direction[pixel])
-    normal = wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
-    share = wp.cw_mul(diffuse_share(s.bsdf), s.bsdf.diffuse) / wp.pi
+    normal = shading_normal(s)
+    share = diffuse_value(s.bsdf)
     light = wp.cw_mul(share, record_light(sets, lists, sky, record, wp.vec3(1.0 - u - v, u, v), normal))
     if buffers.unbiased != 0:
         buffers.known[pixel] = light

@@ -97,6 +97,12 @@ def traced_sample(
     return light
 
 
+# The value of the diffuse lobe, by which polygons' light is reflected, 1/sr.
+@wp.func
+def diffuse_value(bsdf: Bsdf) -> wp.vec3:
+    return wp.cw_mul(diffuse_share(bsdf), bsdf.diffuse) / wp.pi
+
+
 # Thread: a pixel. Adds the samples of the current camera sample, where rays are traced.
 @wp.kernel
 def trace_polygons(
@@ -122,7 +128,7 @@ def trace_polygons(
     share = wp.vec3(0.0, 0.0, 0.0)
     lobe = s.bsdf
     if is_known:
-        share = wp.cw_mul(diffuse_share(s.bsdf), s.bsdf.diffuse) / wp.pi
+        share = diffuse_value(s.bsdf)
         lobe.diffuse = wp.vec3(0.0, 0.0, 0.0)
     seed = pixel_seed(p[0], p[1], settings.sample_bits, settings.seed)
     for k in range(settings.sample_count):

@@ -9,7 +9,7 @@ evaluator; where that is an approximation, one pixel in a few adds its differenc
 
 import warp as wp
 
-from warp_gi.kernels.bsdf import Bsdf, bsdf_evaluate, bsdf_sample, diffuse_share, luminance
+from warp_gi.kernels.bsdf import Bsdf, bsdf_evaluate, bsdf_sample, luminance
 from warp_gi.kernels.bvh import bvh_occluded
 from warp_gi.kernels.environment import (
     environment_lookup,
@@ -34,7 +34,7 @@ from warp_gi.kernels.sampling import (
     sample_1d,
     sample_2d,
 )
-from warp_gi.kernels.surface import Surface, ray_origin, surface_at
+from warp_gi.kernels.surface import Surface, ray_origin, shading_normal, surface_at
 from warp_gi.kernels.types import ENVIRONMENT_MAP, Environment, SceneData
 from warp_gi.kernels.visibility_polygons import (
     MATCHED,
@@ -46,7 +46,7 @@ from warp_gi.kernels.visibility_polygons import (
     walk_stepped,
 )
 from warp_gi.kernels.visibility_polygons_sky import PolygonSky, record_light
-from warp_gi.kernels.visibility_polygons_trace import PolygonBuffers, add_equal, needs_rays, seen_record
+from warp_gi.kernels.visibility_polygons_trace import PolygonBuffers, add_equal, diffuse_value, needs_rays, seen_record
 
 wp.set_module_options({"enable_backward": False})
 
@@ -211,8 +211,8 @@ def correct_polygons(
     u = hits.u[pixel]
     v = hits.v[pixel]
     s = surface_at(scene, face, u, v, -hits.direction[pixel])
-    normal = wp.vec3(s.shading[0, 2], s.shading[1, 2], s.shading[2, 2])
-    share = wp.cw_mul(diffuse_share(s.bsdf), s.bsdf.diffuse) / wp.pi
+    normal = shading_normal(s)
+    share = diffuse_value(s.bsdf)
     light = wp.cw_mul(share, record_light(sets, lists, sky, record, wp.vec3(1.0 - u - v, u, v), normal))
     known = buffers.known[pixel]
     buffers.known[pixel] = known + (light - known) * wp.float32(EXACT_IN)
@@ -243,7 +243,7 @@ def trace_unbiased(
         return
     weights = wp.vec3(1.0 - hits.u[pixel] - hits.v[pixel], hits.u[pixel], hits.v[pixel])
     s = surface_at(scene, face, hits.u[pixel], hits.v[pixel], view)
-    share = wp.cw_mul(diffuse_share(s.bsdf), s.bsdf.diffuse) / wp.pi
+    share = diffuse_value(s.bsdf)
     local = wp.transpose(frame_of(record_normal(sets, lists.corner_sets[record], weights)))
     seed = pixel_seed(p[0], p[1], settings.sample_bits, settings.seed)
     start = settings.first_sample

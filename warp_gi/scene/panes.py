@@ -23,7 +23,6 @@ class Panes:
         colored = np.array([has_colored_tint(material) for material in materials])
         self._faces = np.flatnonzero(colored[flat.materials]).astype(np.int32)
         self._corners = flat.indices[self._faces]
-        self._device = device
         self.data = types.Panes()
         self.data.faces = on_device(self._faces, wp.int32, device)
         self.data.count = len(self._faces)
