@@ -42,6 +42,8 @@ class Guides:
     guide_normal: wp.array(dtype=wp.vec3)  # of shading
     guide_plane: wp.array(dtype=wp.vec3)  # geometric normal
     guide_object: wp.array(dtype=wp.int32)  # 1 + object, 0 on a miss
+    guide_alpha: wp.array(dtype=wp.float32)  # of GGX, 0 where it is not known
+    guide_reflected: wp.array(dtype=wp.float32)  # metres to what a smooth surface reflects, 0 elsewhere
 
 
 # Means of a frame, [height * width]. The lobes are what estimators handed over apart; empty where none did.

@@ -73,6 +73,7 @@ class SurfaceBuffers:
     guide_normal: wp.array(dtype=wp.vec3)
     guide_plane: wp.array(dtype=wp.vec3)
     guide_object: wp.array(dtype=wp.int32)
+    guide_alpha: wp.array(dtype=wp.float32)
     guide_ratio: wp.array(dtype=wp.vec3)  # of this camera sample, see layers.py; empty without blended surfaces
 
 
@@ -193,6 +194,7 @@ def keep_guides(
         buffers.guide_normal[pixel] = shading_normal(s)
         buffers.guide_plane[pixel] = s.normal
         buffers.guide_object[pixel] = object_id + 1
+        buffers.guide_alpha[pixel] = s.bsdf.alpha
 
 
 # Motion of a point that the ray of a direction shows, in pixels: where it was, minus where it is.

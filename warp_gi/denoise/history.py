@@ -91,7 +91,7 @@ class History:
         )
 
 
-READ_GUIDES = ("guide_object", "guide_normal", "guide_position")
+READ_GUIDES = ("guide_object", "guide_normal", "guide_position", "guide_reflected")
 """Guides that the next frame reads (``denoise.same_surface``)."""
 
 

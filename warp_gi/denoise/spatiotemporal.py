@@ -12,7 +12,7 @@ import warp as wp
 from warp_gi.denoise.base import Denoiser
 from warp_gi.denoise.history import ApartHistory, History, light_of
 from warp_gi.errors import OptionError, check_whole
-from warp_gi.kernels import apart_lights, denoise, denoise_apart, denoise_edges
+from warp_gi.kernels import apart_lights, denoise, denoise_apart, denoise_edges, denoise_reflections
 from warp_gi.scene.apart import ApartLights, has_apart_lights
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ class SpatioTemporal(Denoiser):
     frames: int = 32
     """Most frames in the average of diffuse light, 1 to 1024. 1 is no average over frames."""
     glossy_frames: int = 16
-    """Most frames in the average of glossy light, which moves over surfaces as the camera does."""
+    """Most frames in the average of glossy light. On smooth surfaces it moves as the mirror image does."""
     levels: int = 4
     """Levels of the filter of diffuse light over pixels, 0 to 8: each reaches twice as far as the one before, and the
     first to the next pixels. 0 is no filter. A frame without a frame before has one more."""
@@ -105,14 +105,15 @@ class SpatioTemporal(Denoiser):
 
     @property
     def saves_state(self) -> bool:
-        """True: a file holds what the next frame reads, some 70 bytes a pixel."""
+        """True: a file holds what the next frame reads, some 74 bytes a pixel."""
         return True
 
     def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
-        """Return the kernels of the filter, of edges, and of light that is apart."""
+        """Return the kernels of the filter, of reflections, of edges, and of light that is apart."""
+        reflections = (denoise_reflections.reproject_reflections,) if self.glossy_frames > 1 else ()
         edges = (denoise_edges.sample_edges,) if self.edge_samples or self.blend < 1 else ()
         apart = (denoise_apart.average_apart,) if self.samplers(scene) else ()
-        return (denoise.separate_light, *edges, *apart)
+        return (denoise.separate_light, *reflections, *edges, *apart)
 
     def samplers(self, scene: Scene | BakedScene | None = None) -> tuple[Any, ...] | None:
         """Return the lights that paths keep apart, if the scene has any."""
@@ -138,8 +139,10 @@ class SpatioTemporal(Denoiser):
         has_history = state.leads_to(frame)
         if has_history:
             average, changes = self._accumulated(frame, settings, state, guides, average)
-        if not has_history:
-            settings.settles, settings.normal = 0, FIRST_NORMAL * settings.normal
+        else:
+            settings.settles = 0
+            self._reflect(frame, settings, guides, state, average)
+            settings.normal = FIRST_NORMAL * settings.normal
             settings.luminance = FIRST_LUMINANCE * settings.luminance
         filtered = self._filtered(frame, settings, guides, average, 0 if has_history else 1)
         apart = self._apart(frame, settings, state if has_history else None, guides, filtered)
@@ -160,6 +163,7 @@ class SpatioTemporal(Denoiser):
         """Return the average over frames with this one in it, and where light has changed, unless nothing asks."""
         average, changes = self._signals(frame), denoise.Changes()
         frame.launch(denoise.reproject, [settings, guides, state.guides, state.average, average])
+        self._reflect(frame, settings, guides, state, average)
         columns, rows = (math.ceil(size / int(denoise.BLOCK)) for size in frame.camera.resolution)
         changes.columns = columns
         changes.diffuse = wp.empty(columns * rows, dtype=wp.float32, device=frame.device)
@@ -168,6 +172,21 @@ class SpatioTemporal(Denoiser):
             frame.launch(denoise.find_changes, [settings, noisy, average, changes], columns * rows)
         frame.launch(denoise.add_frame, [settings, noisy, average, changes, average])
         return average, changes if self.lag > 0 else None
+
+    def _reflect(
+        self,
+        frame: Frame,
+        settings: denoise.DenoiseSettings,
+        guides: denoise.Guides,
+        state: History,
+        average: denoise.Signals,
+    ) -> None:
+        """Find what smooth surfaces reflect, and let the average of their glossy light move with that."""
+        if frame.has_camera_rays and self.glossy_frames > 1:
+            views = denoise_reflections.Views()
+            views.now, views.before = frame.camera_data, frame.previous_camera_data
+            inputs = [frame.data, views, settings, guides, state.guides, state.average, average]
+            frame.launch(denoise_reflections.reproject_reflections, inputs)
 
     def _filtered(
         self,
