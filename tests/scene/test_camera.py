@@ -127,3 +127,21 @@ def test_path_from_gltf_follows_the_camera_node(tmp_path):
     scene = gi.load_scene(tmp_path / "moving.glb")
     shots = find_shots(parse([str(tmp_path / "moving.glb")]), scene_camera(scene, "view"))
     assert len(shots) == 25 and np.allclose(shots[12].camera.position, [1, 0, 5], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "changes, what",
+    [
+        ({"up": 60.0}, "up of a camera key must be 3 numbers, got 60.0"),
+        ({"eye": (0, 0)}, "eye of a camera key must be 3 numbers"),
+        ({"target": "here"}, "target of a camera key must be 3 numbers"),
+        ({"lens_shift": 0.1}, "lens_shift of a camera key must be 2 numbers"),
+        ({"hfov": "60"}, "hfov of a camera key must be a number"),
+        ({"time": None}, "time of a camera key must be a number"),
+    ],
+)
+def test_values_of_keys_are_numbers(changes, what):
+    values = {"time": 0.0, "eye": (0, 0, 3), "target": (0, 0, 0)}
+    with pytest.raises(OptionError, match=what):
+        gi.CameraKey(**values | changes)
+    assert gi.CameraKey(0.0, np.zeros(3), [0, 0, 1]) == gi.CameraKey(0.0, (0, 0, 0), (0, 0, 1))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warp_gi.errors import OptionError, SceneError, unknown_name
+from warp_gi.errors import OptionError, SceneError, check_number, unknown_name
 from warp_gi.files import user_path
 from warp_gi.scene.animation import key_times
 from warp_gi.scene.camera_files import naming_file, read_camera_file
@@ -38,7 +38,7 @@ STILL_FPS = 24.0
 
 @dataclass(frozen=True)
 class CameraKey:
-    """A camera pose at a time."""
+    """A camera pose at a time. Raises OptionError for values that are not numbers, or not as many as stated."""
 
     time: float
     """Time of the key in seconds."""
@@ -58,6 +58,23 @@ class CameraKey:
     """Whether the vertical field of view, and not the horizontal one, stays at another resolution."""
     ortho_width: float = 0.0
     """Width in metres of what an orthographic camera shows; 0 is a perspective camera."""
+
+    def __post_init__(self) -> None:
+        for name, count in (("eye", 3), ("target", 3), ("up", 3), ("lens_shift", 2)):
+            object.__setattr__(self, name, _numbers(name, getattr(self, name), count))
+        for name in ("time", "hfov", "pixel_aspect", "ortho_width"):
+            check_number(f"{name} of a camera key", getattr(self, name))
+
+
+def _numbers(name: str, value: object, count: int) -> tuple[float, ...]:
+    """Return a value of a camera key as a tuple; raises OptionError unless it is so many numbers."""
+    try:
+        numbers = np.array(value, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        numbers = np.empty(0)
+    if numbers.shape != (count,):
+        raise OptionError(f"{name} of a camera key must be {count} numbers, got {value!r:.80}")
+    return tuple(numbers.tolist())
 
 
 @dataclass(frozen=True)
