@@ -323,10 +323,35 @@ OCCLUDED = (
     + QUERY % ", hint"
 )
 
-# The stack holds what is left to visit, each node's children from far to near.
+# The triangle test's t is the less exact the more edge-on a triangle is: it is found anew, in double precision, and so
+# are u, v. What rounding would put out of its range stays in. The stack holds what is left to visit, each
+# node's children from far to near.
 INTERSECT = (
     TRAVERSAL
     + """
+        inline wp::vec4 exact(const float* at, float t_max, wp::vec4 hit) const {
+            double a[3], b[3], c[3], d[3];  // edges, from the origin to vertex 0, direction
+            for (int k = 0; k < 3; ++k) {
+                const double p0 = at[LANES * k];
+                a[k] = at[LANES * (3 + k)] - p0;
+                b[k] = at[LANES * (6 + k)] - p0;
+                c[k] = p0 - start[k];
+                d[k] = way[k];
+            }
+            const double n[3] = {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
+            const double r[3] = {c[1] * d[2] - c[2] * d[1], c[2] * d[0] - c[0] * d[2], c[0] * d[1] - c[1] * d[0]};
+            const double inverse = 1.0 / (n[0] * d[0] + n[1] * d[1] + n[2] * d[2]);
+            const float t = (float)((n[0] * c[0] + n[1] * c[1] + n[2] * c[2]) * inverse);
+            const float u = (float)((r[0] * b[0] + r[1] * b[1] + r[2] * b[2]) * inverse);
+            const float v = (float)((r[0] * a[0] + r[1] * a[1] + r[2] * a[2]) * -inverse);
+            if (t > 0.0f && t < t_max) hit[0] = t;
+            if (u > -1e-3f && v > -1e-3f && u + v < 1.001f) {
+                hit[1] = u < 0.0f ? 0.0f : (u > 1.0f ? 1.0f : u);
+                hit[2] = v < 0.0f ? 0.0f : (v > 1.0f - hit[1] ? 1.0f - hit[1] : v);
+            }
+            hit[3] = __builtin_bit_cast(float, ((const int*)at)[FACE_WORD] & ~FACE_MASKED);
+            return hit;
+        }
         __attribute__((noinline)) wp::vec4 run(
             float ox, float oy, float oz, float dx, float dy, float dz, float t_max
         ) const {
@@ -334,6 +359,7 @@ INTERSECT = (
             wp::vec4 hit(t_max, 0.0f, 0.0f, __builtin_bit_cast(float, -1));
             if (!ray.setup((f4) {ox, oy, oz, 0.0f}, (f4) {dx, dy, dz, 1.0f})) return hit;
             float limit = t_max / ray.scale;
+            const float* nearest_at = nullptr;  // the vertices of the triangle hit, one number in LANES
             Entry stack[STACK_SIZE];
             int size = 0, child = 0;
             while (true) {
@@ -377,13 +403,13 @@ INTERSECT = (
                         const int face = ((const int*)block)[FACE_WORD + lane];
                         if (t[lane] >= limit || passes(face, u[lane], v[lane])) continue;
                         limit = t[lane];
-                        const int plain_face = face & ~FACE_MASKED;
-                        hit = wp::vec4(limit * ray.scale, u[lane], v[lane], __builtin_bit_cast(float, plain_face));
+                        nearest_at = block + lane;
+                        hit = wp::vec4(limit * ray.scale, u[lane], v[lane], 0.0f);
                     }
                 }
                 Entry top;
                 do {
-                    if (!size) return hit;
+                    if (!size) return nearest_at ? exact(nearest_at, t_max, hit) : hit;
                     top = stack[--size];
                 } while (__builtin_bit_cast(float, (unsigned)(top >> 32)) > limit * 1.000001f);
                 child = (int)(unsigned)top;
