@@ -275,14 +275,14 @@ WIDEN = (
         }
         unsigned* wide_node = wide.data + NODE_WORDS * (long long)item.wide;
         for (int c = 0; c < child_count; ++c) {
-            const int n = roots_found[c];
+            const int n = roots_found[c], lane = child_count - 1 - c;  // the most promising last
             if (choices.data[8ll * n]) {
-                if (!dry) wide_node[48 + c] = NODE_STEPS * wide_count;
+                if (!dry) wide_node[48 + lane] = NODE_STEPS * wide_count;
                 stack[waiting++] = {n, wide_count++};
                 continue;
             }
             if (!dry) {
-                wide_node[48 + c] = ~(BLOCK_STEPS * block_count);
+                wide_node[48 + lane] = ~(BLOCK_STEPS * block_count);
                 int* faces = (int*)blocks.data + BLOCK_WORDS * (long long)block_count + FACE_WORD;
                 int lanes = 0;
                 const int left = Builder::word(tree[n].high), last = left ? n + 2 * Builder::word(tree[n].low) - 2 : n;

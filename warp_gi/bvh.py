@@ -17,6 +17,7 @@ from warp_gi.kernels import types
 
 ORDERED_RAYS = 1 << 15  # rays are ordered before they are traced if a batch has at least so many
 ORDERED_BYTES = 1 << 25  # and the tree has at least so many bytes
+SHARE = 256  # rays that a thread traces on the CPU
 NO_GLASS = (0.0, -1, 0.0, 0.0)
 
 
@@ -154,7 +155,7 @@ class TriangleBvh:
         rays = self._rays(origins, directions, t_max)
         count = len(rays.origins)
         result = wp.empty(count, dtype=wp.uint8, device=self.device)
-        launch.launch(batch.occluded_rays, count, [self.data, rays, result], self.device)
+        self._trace(batch.occluded_rays, rays, result)
         return result
 
     def intersect(self, origins: object, directions: object, t_max: object = np.inf) -> Hits:
@@ -164,8 +165,12 @@ class TriangleBvh:
         hits = batch.RayHits()
         hits.t, hits.u, hits.v = (wp.empty(count, dtype=wp.float32, device=self.device) for _ in range(3))
         hits.face = wp.empty(count, dtype=wp.int32, device=self.device)
-        launch.launch(batch.intersect_rays, count, [self.data, rays, hits], self.device)
+        self._trace(batch.intersect_rays, rays, hits)
         return Hits(hits.t, hits.face, hits.u, hits.v)
+
+    def _trace(self, kernel: wp.Kernel, rays: batch.RayBatch, found: object) -> None:
+        share = SHARE if self.device.is_cpu else 1
+        launch.launch(kernel, -(-len(rays.origins) // share), [self.data, rays, share, found], self.device, 1)
 
     def _rays(self, origins: object, directions: object, t_max: object) -> batch.RayBatch:
         rays = batch.RayBatch()

@@ -97,7 +97,8 @@ def test_hits_are_exact_where_triangles_are_edge_on():
     weights = rng.dirichlet([1, 1, 1], 20000)
     target = (points[indices[face]].astype(np.float64) * weights[..., None]).sum(1)
     along = points[indices[face, 1]] - points[indices[face, 0]]
-    directions = (along + rng.normal(size=(20000, 3)) * 0.01 * np.linalg.norm(along, axis=1)[:, None]).astype(np.float32)
+    spread = 0.01 * np.linalg.norm(along, axis=1)[:, None]
+    directions = (along + rng.normal(size=(20000, 3)) * spread).astype(np.float32)
     origins = (target - 3.0 * directions).astype(np.float32)
     hits = tree.intersect(origins, directions)
     t, u, v, face = (getattr(hits, name).numpy() for name in ("t", "u", "v", "face"))
