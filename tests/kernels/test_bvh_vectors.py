@@ -1,4 +1,4 @@
-"""The traversals for CPUs with AVX2 and AVX-512 and for all others: the same hits, whatever the code was compiled for."""
+"""The traversals for CPUs with AVX2, with AVX-512 and for all others: the same hits from each."""
 
 from __future__ import annotations
 
