@@ -1,7 +1,7 @@
 """Embree 4 at its best: trees of medium and high quality, single rays and packets of 16, through ctypes.
 
 The library is the one that embreex brings; embreex itself builds trees of medium quality alone. Rays are traced in a
-native loop (embree_kernels.py), so no call of Python is counted.
+native loop (kernels.py), so no call of Python is counted.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import numpy as np
 import warp as wp
 
 from warp_gi import launch
-from warp_gi.bench.suites.rays import embree_kernels as kernels
+from warp_gi.bench.suites.rays import kernels
 
 QUALITIES = {"medium": 1, "high": 2}  # of enum RTCBuildQuality
 ROBUST = 1 << 2  # of enum RTCSceneFlags
 VERTICES, FLOAT3 = 1, 0x9003  # of enum RTCBufferType, RTCFormat
 INDICES, UINT3 = 0, 0x5003
-SHARE = 256  # rays that a thread traces, as in embree_kernels.py
+SHARE = 256  # rays that a thread traces, as in kernels.py
 
 
 @functools.cache
@@ -117,7 +117,7 @@ class EmbreeScene:
         far: wp.array = wp.array(np.ascontiguousarray(limits, np.float32), dtype=wp.float32, device=device, copy=False)
         found = wp.empty(count, dtype=wp.int32, device=device)
         name = ("rtcIntersect" if query == "closest" else "rtcOccluded") + ("16" if packets else "1")
-        function = ctypes.cast(getattr(library(), name), ctypes.c_void_p).value
+        function = ctypes.cast(getattr(library(), name), ctypes.c_void_p).value or 0
         kernel = kernels.trace_packets if packets else kernels.trace_rays
         inputs = [wp.uint64(function), wp.uint64(self._scene), *rays, far, int(query == "closest"), found]
         launch.launch(kernel, -(-count // SHARE), inputs, device, 1)
