@@ -1,54 +1,108 @@
 """Building the eight-wide tree of bvh.py on the CPU.
 
-Four stages, each a kernel: triangle bounds (`bound_triangles`); a binary tree down to single triangles by binned
-surface-area heuristic, in disjoint subtrees that threads share (`split_top`, `build_subtrees`), with the cost of
-the best eight-wide tree over each binary node by dynamic programming (Ylitie, Karras, Laine: "Efficient
+Stages, each a kernel or two: triangle bounds (`bound_triangles`); a binary tree down to single triangles by binned
+surface-area heuristic, in disjoint subtrees that threads share (`split_top`, `build_subtrees`); its improvement by
+reinsertion, where it is asked for (`link_nodes`, `node_areas`, `find_targets`, `move_nodes`, `flatten`); the cost of
+the best eight-wide tree over each binary node by dynamic programming (`cost_nodes`; Ylitie, Karras, Laine: "Efficient
 Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs", HPG 2017, section 3.1); the wide tree's topology
 (`widen`); its geometry (`fill_blocks`, `fill_nodes`), which is all that a refit repeats.
 
-Scratch, eight 32-bit words each. Reference: low x, y, z, triangle, high x, y, z, area. Binary node: low x, y, z,
+Scratch, eight 32-bit words each. Reference: low x, y, z, triangle, high x, y, z, 0. Binary node: low x, y, z,
 triangle count, high x, y, z, triangle count of the left child (0 in a leaf, whose triangle it holds). A node over
 n references lies before its left subtree's 2 n_left - 1 nodes and those before the right one's.
 """
 
 import warp as wp
 
-from warp_gi.kernels.bvh_build_native import BLOCK_COST, BUILD_SUBTREE, FILL_NODES, NODE_COST, SPLIT_TOP, WIDEN
+from warp_gi.kernels.bvh_build_native import (
+    BLOCK_COST,
+    BUILD_SUBTREE,
+    CHUNK_NODES,
+    COST_NODES,
+    FILL_NODES,
+    NODE_COST,
+    SPLIT_TOP,
+    WIDEN,
+)
 from warp_gi.kernels.bvh_native import BLOCK_WORDS, FACE_MASKED, FACE_WORD, LANES, NODE_WORDS, cpu_only
+from warp_gi.kernels.bvh_reinsert_native import FIND_TARGET, FLATTEN, LINK_NODE, MOVE_NODES
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})  # unrolled, it compiles for 1.2 s longer
 
+COSTS = {"NODE_COST": NODE_COST, "BLOCK_COST": BLOCK_COST, "CHUNK_NODES": CHUNK_NODES}
 BOX_WORDS = 8  # of the scratch in which bounds travel upwards
 
 
-@wp.func_native(cpu_only(SPLIT_TOP, NODE_COST=NODE_COST, BLOCK_COST=BLOCK_COST))
+@wp.func_native(cpu_only(SPLIT_TOP, **COSTS))
 def split_top_native(
     refs: wp.array(dtype=wp.float32),
     nodes: wp.array(dtype=wp.float32),
-    costs: wp.array(dtype=wp.float32),
     tasks: wp.array(dtype=wp.int32),
-    top: wp.array(dtype=wp.int32),
     counts: wp.array(dtype=wp.int32),
     count: wp.int32,
     largest: wp.int32,
 ): ...
 
 
-@wp.func_native(cpu_only(BUILD_SUBTREE, NODE_COST=NODE_COST, BLOCK_COST=BLOCK_COST))
+@wp.func_native(cpu_only(BUILD_SUBTREE, **COSTS))
 def build_subtree_native(
     refs: wp.array(dtype=wp.float32),
     nodes: wp.array(dtype=wp.float32),
     tasks: wp.array(dtype=wp.int32),
-    costs: wp.array(dtype=wp.float32),
-    choices: wp.array(dtype=wp.uint8),
     index: wp.int32,
 ): ...
 
 
-@wp.func_native(cpu_only(WIDEN, NODE_COST=NODE_COST, BLOCK_COST=BLOCK_COST))
+@wp.func_native(cpu_only(LINK_NODE, **COSTS))
+def link_node_native(nodes: wp.array(dtype=wp.float32), parents: wp.array(dtype=wp.int32), node: wp.int32): ...
+
+
+@wp.func_native(cpu_only(FIND_TARGET, **COSTS))
+def find_target_native(
+    nodes: wp.array(dtype=wp.float32),
+    parents: wp.array(dtype=wp.int32),
+    gains: wp.array(dtype=wp.float32),
+    targets: wp.array(dtype=wp.int32),
+    index: wp.int32,
+    start: wp.int32,
+): ...
+
+
+@wp.func_native(cpu_only(MOVE_NODES, **COSTS))
+def move_nodes_native(
+    nodes: wp.array(dtype=wp.float32),
+    parents: wp.array(dtype=wp.int32),
+    counts: wp.array(dtype=wp.int32),
+    touched: wp.array(dtype=wp.int32),
+    candidates: wp.array(dtype=wp.int32),
+    targets: wp.array(dtype=wp.int32),
+    order: wp.array(dtype=wp.int32),
+    pass_number: wp.int32,
+): ...
+
+
+@wp.func_native(cpu_only(FLATTEN, **COSTS))
+def flatten_native(
+    nodes: wp.array(dtype=wp.float32),
+    flat: wp.array(dtype=wp.float32),
+    waiting: wp.array(dtype=wp.int32),
+    counts: wp.array(dtype=wp.int32),
+): ...
+
+
+@wp.func_native(cpu_only(COST_NODES, **COSTS))
+def cost_nodes_native(
+    nodes: wp.array(dtype=wp.float32),
+    surfaces: wp.array(dtype=wp.float32),
+    costs: wp.array(dtype=wp.float32),
+    choices: wp.array(dtype=wp.uint8),
+    chunk: wp.int32,
+): ...
+
+
+@wp.func_native(cpu_only(WIDEN, **COSTS))
 def widen_native(
     nodes: wp.array(dtype=wp.float32),
-    top: wp.array(dtype=wp.int32),
     counts: wp.array(dtype=wp.int32),
     costs: wp.array(dtype=wp.float32),
     choices: wp.array(dtype=wp.uint8),
@@ -70,12 +124,25 @@ def fill_nodes_native(
 @wp.struct
 class BuildData:
     refs: wp.array(dtype=wp.float32)  # [8 * triangle]
+    surfaces: wp.array(dtype=wp.float32)  # [triangle] areas
     nodes: wp.array(dtype=wp.float32)  # [8 * binary node]
     tasks: wp.array(dtype=wp.int32)  # [4 * subtree] references from, to, first node, depth
-    top: wp.array(dtype=wp.int32)  # [node] binary nodes above the subtrees, parents first
-    counts: wp.array(dtype=wp.int32)  # [4] subtrees, top nodes, wide nodes (-1: not counted yet), blocks
+    # [5] subtrees, depth after reinsertion, wide nodes (-1: not counted yet), blocks, root while nodes are linked
+    counts: wp.array(dtype=wp.int32)
     costs: wp.array(dtype=wp.float32)  # [8 * binary node]
     choices: wp.array(dtype=wp.uint8)  # [8 * binary node]
+
+
+# Scratch of reinsertion; see bvh_reinsert_native.py.
+@wp.struct
+class ReinsertData:
+    nodes: wp.array(dtype=wp.float32)  # those of BuildData
+    counts: wp.array(dtype=wp.int32)  # those of BuildData
+    parents: wp.array(dtype=wp.int32)  # [binary node]
+    touched: wp.array(dtype=wp.int32)  # [binary node + 1] the last pass that changed what is around a node
+    candidates: wp.array(dtype=wp.int32)  # [candidate] nodes to move
+    gains: wp.array(dtype=wp.float32)  # [candidate]
+    targets: wp.array(dtype=wp.int32)  # [candidate] nodes beside which they would be, -1 for none
 
 
 # Thread: one triangle.
@@ -85,6 +152,7 @@ def bound_triangles(
     points: wp.array(dtype=wp.vec3),
     indices: wp.array(dtype=wp.vec3i),
     refs: wp.array(dtype=wp.float32),
+    surfaces: wp.array(dtype=wp.float32),
 ):
     face = first + wp.tid()
     corner = indices[face]
@@ -97,35 +165,66 @@ def bound_triangles(
         refs[8 * face + k] = low[k]
         refs[8 * face + 4 + k] = high[k]
     refs[8 * face + 3] = wp.cast(face, wp.float32)
-    refs[8 * face + 7] = 0.5 * wp.length(wp.cross(p1 - p0, p2 - p0))
+    refs[8 * face + 7] = 0.0
+    surfaces[face] = 0.5 * wp.length(wp.cross(p1 - p0, p2 - p0))
 
 
 # One thread: splits until no range has more than `largest` triangles, and lists the ranges as tasks.
 @wp.kernel
 def split_top(first: wp.int32, build: BuildData, largest: wp.int32):
-    split_top_native(
-        build.refs,
-        build.nodes,
-        build.costs,
-        build.tasks,
-        build.top,
-        build.counts,
-        build.refs.shape[0] // 8,
-        largest,
-    )
+    split_top_native(build.refs, build.nodes, build.tasks, build.counts, build.refs.shape[0] // 8, largest)
 
 
 # Thread: one task of split_top.
 @wp.kernel
 def build_subtrees(first: wp.int32, build: BuildData):
-    build_subtree_native(
-        build.refs,
-        build.nodes,
-        build.tasks,
-        build.costs,
-        build.choices,
-        first + wp.tid(),
+    build_subtree_native(build.refs, build.nodes, build.tasks, first + wp.tid())
+
+
+# Thread: one binary node.
+@wp.kernel
+def link_nodes(first: wp.int32, data: ReinsertData):
+    link_node_native(data.nodes, data.parents, first + wp.tid())
+
+
+# Thread: one binary node: half the area of its box.
+@wp.kernel
+def node_areas(first: wp.int32, nodes: wp.array(dtype=wp.float32), areas: wp.array(dtype=wp.float32)):
+    n = first + wp.tid()
+    x = nodes[8 * n + 4] - nodes[8 * n]
+    y = nodes[8 * n + 5] - nodes[8 * n + 1]
+    z = nodes[8 * n + 6] - nodes[8 * n + 2]
+    areas[n] = x * y + y * z + z * x
+
+
+# Thread: one candidate: its best target.
+@wp.kernel
+def find_targets(first: wp.int32, data: ReinsertData):
+    i = first + wp.tid()
+    find_target_native(data.nodes, data.parents, data.gains, data.targets, i, data.candidates[i])
+
+
+# One thread: moves candidates to their targets, in order.
+@wp.kernel
+def move_nodes(first: wp.int32, data: ReinsertData, order: wp.array(dtype=wp.int32), pass_number: wp.int32):
+    move_nodes_native(
+        data.nodes, data.parents, data.counts, data.touched, data.candidates, data.targets, order, pass_number
     )
+
+
+# One thread: writes the nodes in depth-first order.
+@wp.kernel
+def flatten(first: wp.int32, data: ReinsertData, flat: wp.array(dtype=wp.float32)):
+    flatten_native(data.nodes, flat, data.touched, data.counts)
+
+
+# Thread: CHUNK_NODES binary nodes, those whose subtrees lie among them; `rest` takes those of all others, one thread.
+@wp.kernel
+def cost_nodes(first: wp.int32, build: BuildData, rest: wp.int32):
+    chunk = first + wp.tid()
+    if rest != 0:
+        chunk = -1
+    cost_nodes_native(build.nodes, build.surfaces, build.costs, build.choices, chunk)
 
 
 # One thread: counts wide nodes and blocks in the first call, writes children and faces in the second.
@@ -136,7 +235,7 @@ def widen(
     nodes: wp.array(dtype=wp.uint32),
     blocks: wp.array(dtype=wp.float32),
 ):
-    widen_native(build.nodes, build.top, build.counts, build.costs, build.choices, nodes, blocks)
+    widen_native(build.nodes, build.counts, build.costs, build.choices, nodes, blocks)
 
 
 @wp.func

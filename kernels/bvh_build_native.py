@@ -2,6 +2,7 @@
 
 NODE_COST = 1.0  # visiting a node, relative to ...
 BLOCK_COST = 1.0  # ... testing a block of triangles
+CHUNK_NODES = 1 << 14  # binary nodes whose costs one thread finds
 
 
 BINARY = """
@@ -114,7 +115,7 @@ BINARY = """
         }
 
         // Writes the node over a task's references; splits them and returns their middle, or 0 for a leaf.
-        static int node(Reference* refs, Reference* nodes, float* surface, const Task& task) {
+        static int node(Reference* refs, Reference* nodes, const Task& task) {
             f4 l = refs[task.begin].low, h = refs[task.begin].high, first = xyz(l) + h, last = first;
             for (int i = task.begin + 1; i < task.end; ++i) {
                 const f4 center = xyz(refs[i].low) + refs[i].high;
@@ -127,7 +128,6 @@ BINARY = """
             else if (count > 2 && task.depth > DEEP) middle = task.begin + count / 2;
             else if (count > 2 && count <= SWEEP) middle = sweep(refs, task.begin, task.end);
             else if (count > 2) middle = bin(refs, task.begin, task.end, first, last);
-            if (!middle) surface[8ll * task.base + 7] = refs[task.begin].high[3];
             nodes[task.base].low = with_word(l, count == 1 ? word(refs[task.begin].low) : count);
             nodes[task.base].high = with_word(h, middle ? middle - task.begin : 0);
             return middle;
@@ -140,13 +140,16 @@ BINARY = """
 
         // costs[7]: of the subtree as at most 1..7 wide roots. choice[i]: how many of i + 1 roots go to the left
         // child, 0 to use one root less; choice[0]: 1 for a wide node, 0 for a leaf block.
-        static void cost(const Reference* nodes, float* all_costs, unsigned char* all_choices, int n) {
+        static void cost(
+            const Reference* nodes, const float* surfaces, float* all_costs, unsigned char* all_choices, int n
+        ) {
             float* costs = all_costs + 8ll * n;
             unsigned char* choice = all_choices + 8ll * n;
             const int left_count = word(nodes[n].high);
             const float area = half_area(nodes[n].low, nodes[n].high);
             if (!left_count) {
                 for (int i = 0; i < 7; ++i) costs[i] = area * BLOCK_COST;
+                costs[7] = surfaces[word(nodes[n].low)];
                 for (int i = 0; i < 8; ++i) choice[i] = 0;
                 return;
             }
@@ -178,7 +181,7 @@ SPLIT_TOP = (
     Task* list = (Task*)tasks.data;
     const int most = (int)(tasks.shape[0] / 4);
     Task stack[128];
-    int waiting = 0, top_count = 0, task_count = 0;
+    int waiting = 0, task_count = 0;
     stack[waiting++] = {0, count, 0, 0};
     while (waiting) {
         const Task task = stack[--waiting];
@@ -186,13 +189,11 @@ SPLIT_TOP = (
             list[task_count++] = task;
             continue;
         }
-        const int middle = Builder::node(references, tree, costs.data, task);
-        top.data[top_count++] = task.base;
+        const int middle = Builder::node(references, tree, task);
         Builder::children(task, middle, stack[waiting + 1], stack[waiting]);
         waiting += 2;
     }
     counts.data[0] = task_count;
-    counts.data[1] = top_count;
 """
 )
 
@@ -206,13 +207,26 @@ BUILD_SUBTREE = (
     stack[waiting++] = subtree;
     while (waiting) {
         const Task task = stack[--waiting];
-        const int middle = Builder::node((Reference*)refs.data, tree, costs.data, task);
+        const int middle = Builder::node((Reference*)refs.data, tree, task);
         if (!middle) continue;
         Builder::children(task, middle, stack[waiting + 1], stack[waiting]);
         waiting += 2;
     }
-    for (int n = subtree.base + 2 * (subtree.end - subtree.begin) - 2; n >= subtree.base; --n)
-        Builder::cost(tree, costs.data, choices.data, n);
+"""
+)
+
+# Costs of the nodes of a chunk whose subtrees end in it; those of all others where `chunk` is -1.
+COST_NODES = (
+    BINARY
+    + """
+    const Reference* tree = (const Reference*)nodes.data;
+    const int count = (int)(nodes.shape[0] / 8), begin = chunk < 0 ? 0 : chunk * CHUNK_NODES;
+    const int end = chunk < 0 || begin + CHUNK_NODES > count ? count : begin + CHUNK_NODES;
+    for (int n = end - 1; n >= begin; --n) {
+        const int last = Builder::word(tree[n].high) ? n + 2 * Builder::word(tree[n].low) - 2 : n;
+        if ((chunk < 0) == (last / CHUNK_NODES != n / CHUNK_NODES))
+            Builder::cost(tree, surfaces.data, costs.data, choices.data, n);
+    }
 """
 )
 
@@ -222,7 +236,6 @@ WIDEN = (
     struct Item { int node, wide; };
     Reference* tree = (Reference*)nodes.data;
     const bool dry = counts.data[2] < 0;  // the first call only counts
-    if (dry) for (int i = counts.data[1] - 1; i >= 0; --i) Builder::cost(tree, costs.data, choices.data, top.data[i]);
     Item stack[1024];
     int waiting = 0, wide_count = 1, block_count = 1;  // block 0 is empty
     stack[waiting++] = {0, 0};
@@ -262,14 +275,14 @@ WIDEN = (
         }
         unsigned* wide_node = wide.data + NODE_WORDS * (long long)item.wide;
         for (int c = 0; c < child_count; ++c) {
-            const int n = roots_found[c];
+            const int n = roots_found[c], lane = child_count - 1 - c;  // the most promising last
             if (choices.data[8ll * n]) {
-                if (!dry) wide_node[48 + c] = NODE_STEPS * wide_count;
+                if (!dry) wide_node[48 + lane] = NODE_STEPS * wide_count;
                 stack[waiting++] = {n, wide_count++};
                 continue;
             }
             if (!dry) {
-                wide_node[48 + c] = ~(BLOCK_STEPS * block_count);
+                wide_node[48 + lane] = ~(BLOCK_STEPS * block_count);
                 int* faces = (int*)blocks.data + BLOCK_WORDS * (long long)block_count + FACE_WORD;
                 int lanes = 0;
                 const int left = Builder::word(tree[n].high), last = left ? n + 2 * Builder::word(tree[n].low) - 2 : n;

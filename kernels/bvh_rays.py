@@ -2,7 +2,9 @@
 
 import warp as wp
 
-from warp_gi.kernels.bvh import bvh_intersect, bvh_occluded
+from warp_gi.kernels.bvh import mesh_intersect, mesh_occluded, runs_on_cuda
+from warp_gi.kernels.bvh_native import cpu_only
+from warp_gi.kernels.bvh_traversal_native import INTERSECT_RAYS, OCCLUDED_RAYS
 from warp_gi.kernels.types import Bvh
 
 wp.set_module_options({"enable_backward": False})
@@ -46,38 +48,38 @@ class RayBatch:
     order: wp.array(dtype=wp.int64)
 
 
-# The ray of a thread; asks for that of a later one ahead of time.
-@wp.func_native(
-    """
-    if (!rays.order.shape[0]) return item;
-#if !defined(__CUDA_ARCH__)
-    if (item + 12 < rays.order.shape[0]) {
-        const long long later = rays.order.data[item + 12];
-        __builtin_prefetch(rays.origins.data + later);
-        __builtin_prefetch(rays.directions.data + later);
-    }
-#endif
-    return (int)rays.order.data[item];
-    """
-)
-def ray_index(rays: RayBatch, item: wp.int32) -> wp.int32: ...
+# CPU: rays begin to end - 1 in native code, which saves a launch's cost a ray.
+@wp.func_native(cpu_only(OCCLUDED_RAYS))
+def occluded_rays_native(
+    bvh: Bvh, rays: RayBatch, begin: wp.int32, end: wp.int32, occluded: wp.array(dtype=wp.uint8)
+): ...
 
 
-# Thread: one ray.
+@wp.func_native(cpu_only(INTERSECT_RAYS))
+def intersect_rays_native(bvh: Bvh, rays: RayBatch, begin: wp.int32, end: wp.int32, hits: RayHits): ...
+
+
+# Thread: `share` rays on the CPU, one on CUDA, where they come in no order but their own.
 @wp.kernel
-def occluded_rays(first: wp.int32, bvh: Bvh, rays: RayBatch, occluded: wp.array(dtype=wp.uint8)):
-    i = ray_index(rays, first + wp.tid())
-    t_max = rays.t_max[wp.min(i, rays.t_max.shape[0] - 1)]
-    occluded[i] = wp.uint8(bvh_occluded(bvh, rays.origins[i], rays.directions[i], t_max))
+def occluded_rays(first: wp.int32, bvh: Bvh, rays: RayBatch, share: wp.int32, occluded: wp.array(dtype=wp.uint8)):
+    i = first + wp.tid()
+    if runs_on_cuda() != 0:
+        t_max = rays.t_max[wp.min(i, rays.t_max.shape[0] - 1)]
+        occluded[i] = wp.uint8(mesh_occluded(bvh, rays.origins[i], rays.directions[i], t_max))
+    else:
+        occluded_rays_native(bvh, rays, i * share, wp.min((i + 1) * share, rays.origins.shape[0]), occluded)
 
 
-# Thread: one ray.
+# Thread: as occluded_rays.
 @wp.kernel
-def intersect_rays(first: wp.int32, bvh: Bvh, rays: RayBatch, hits: RayHits):
-    i = ray_index(rays, first + wp.tid())
-    t_max = rays.t_max[wp.min(i, rays.t_max.shape[0] - 1)]
-    hit = bvh_intersect(bvh, rays.origins[i], rays.directions[i], t_max)
-    hits.t[i] = hit.t
-    hits.face[i] = hit.face
-    hits.u[i] = hit.u
-    hits.v[i] = hit.v
+def intersect_rays(first: wp.int32, bvh: Bvh, rays: RayBatch, share: wp.int32, hits: RayHits):
+    i = first + wp.tid()
+    if runs_on_cuda() != 0:
+        t_max = rays.t_max[wp.min(i, rays.t_max.shape[0] - 1)]
+        hit = mesh_intersect(bvh, rays.origins[i], rays.directions[i], t_max)
+        hits.t[i] = hit.t
+        hits.face[i] = hit.face
+        hits.u[i] = hit.u
+        hits.v[i] = hit.v
+    else:
+        intersect_rays_native(bvh, rays, i * share, wp.min((i + 1) * share, rays.origins.shape[0]), hits)

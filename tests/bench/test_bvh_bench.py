@@ -6,20 +6,27 @@ import numpy as np
 import pytest
 
 import warp_gi as gi
+from warp_gi import bvh as bvh_module
 from warp_gi.bench.harness import runner, scenes
 from warp_gi.bench.harness.places import PLACES
 from warp_gi.bench.suites.rays import suite as rays
 from warp_gi.bench.suites.rays.columns import COLUMNS
+from warp_gi.bench.suites.rays.embree import EmbreeScene
 
 
-def test_rows_hold_every_contender_and_all_agree():
+def test_rows_hold_every_contender_and_all_agree(monkeypatch):
     rng = np.random.default_rng(3)
     corners = rng.normal(size=(300, 3, 3)) * 0.1 + rng.random((300, 1, 3))
     points, indices = corners.reshape(-1, 3).astype(np.float32), np.arange(900, dtype=np.int32).reshape(-1, 3)
+    camera = gi.CameraKey(0.0, (0.5, 0.5, 3.0), (0.5, 0.5, 0.5), hfov=40.0)
+    primary = rays.primary_rays(camera, 6000)
     batches = {
-        "diffuse": rays.diffuse_rays(points, indices, 4000),
-        "primary": rays.primary_rays(gi.CameraKey(0.0, (0.5, 0.5, 3.0), (0.5, 0.5, 0.5), hfov=40.0), 6000),
+        "diffuse": (*rays.diffuse_rays(points, indices, 4000), np.inf),
+        "primary": (*primary, np.inf),
+        "shadow": rays.shadow_rays(gi.TriangleBvh(points, indices), camera, *primary),
     }
+    monkeypatch.setattr(bvh_module, "ORDERED_BYTES", 0)  # as a large tree
+    monkeypatch.setattr(bvh_module, "ORDERED_RAYS", 3000)
     build, *races = rays.compare("soup", points, indices, batches, repetitions=1)
     assert COLUMNS.undeclared([build, *races]) == []
     has_peer = "skipped" not in races[0]
@@ -30,11 +37,34 @@ def test_rows_hold_every_contender_and_all_agree():
         ("diffuse", "closest"),
         ("primary", "any"),
         ("primary", "closest"),
+        ("shadow", "any"),
     ]
     for row in races:
-        assert row["ours Mrays/s"] > 0.0 and row["ours in order Mrays/s"] > 0.0 and row["ours / warp"] > 0.0
+        assert row["ours Mrays/s"] > 0.0 and row["ours in order Mrays/s"] > 0.0
+        assert (row["rays"] == "shadow") == ("ours / warp" not in row)  # its query has no limits here
         if has_peer:
             assert row["agree"] > 0.999 and row["ours / embree"] > 0.0 and row["ours / embree robust"] > 0.0
+            assert 0.0 < row["ours / best"] <= min(row["ours / embree"], row["ours / embree high"]) * 1.000001
+            assert (row["rays"] == "diffuse") == ("ours / embree packets" not in row)
+            assert ("presorted / best" in row) or row["rays"] != "diffuse"
+
+
+@pytest.mark.parametrize("robust", [False, True])
+@pytest.mark.parametrize("quality", ["medium", "high"])
+def test_embree_finds_what_we_find_ray_by_ray_and_in_packets(quality, robust):
+    pytest.importorskip("embreex")
+    rng = np.random.default_rng(8)
+    corners = rng.normal(size=(500, 3, 3)) * 0.1 + rng.random((500, 1, 3))
+    points, indices = corners.reshape(-1, 3).astype(np.float32), np.arange(1500, dtype=np.int32).reshape(-1, 3)
+    origins = rng.random((1001, 3)).astype(np.float32)  # no whole number of packets
+    directions = rng.normal(size=(1001, 3)).astype(np.float32)
+    limits = rng.uniform(0.0, 1.0, 1001).astype(np.float32)
+    tree, scene = gi.TriangleBvh(points, indices), EmbreeScene(points, indices, quality, robust)
+    for far in (np.inf, limits):
+        for query in ("any", "closest"):
+            expected = rays.trace(tree, query, origins, directions, far)
+            for packets in (False, True):
+                assert (scene.trace(query, origins, directions, far, packets) == expected).mean() > 0.998
 
 
 def test_rays_start_on_the_surface_and_are_unit():
@@ -60,7 +90,7 @@ def test_missing_scenes_give_a_row_and_unknown_ones_an_error(monkeypatch, tmp_pa
     rows = rays.run(quick=True)
     missing = [row for row in rows if row.get("skipped") == rays.NO_EMBREE]  # where it is not installed
     rows = [row for row in rows if row not in missing]
-    assert [row["scene"] for row in rows] == ["living room", "sponza", *["box"] * 5] and len(missing) <= 1
+    assert [row["scene"] for row in rows] == ["living room", "sponza", *["box"] * 6] and len(missing) <= 1
     assert all("WARP_GI_SCENES" in row["skipped"] for row in rows[:2])
     assert all(row["triangles"] == gi.builtin_scene("cornell_box").triangle_count for row in rows[2:])
     with pytest.raises(gi.OptionError, match="did you mean 'sponza'"):

@@ -1,14 +1,16 @@
-"""Ray queries and tree builds beside Embree 4 (embreex) and Warp's own mesh queries.
+"""Ray queries and tree builds beside Embree 4 at its best and Warp's own mesh queries.
 
 All get the same rays and triangles, as NumPy arrays, and one thread each; they take turns in one process and the median
 CPU time counts. "ours" is the batch call, which on large trees traces incoherent rays in Morton order and returns them
-in theirs; "ours in order" is what a query inside a kernel costs. "embree" is its fast mode, which may leak through
-edges; "embree robust", watertight like ours, is what embreex makes by default.
+in theirs; "ours in order" is without that. "presorted" are the rays of such a batch given in Morton order to both.
+"embree" is its fast mode, which may leak through edges, "embree robust" is watertight like ours; both are of medium
+quality, its default, and "embree high" has spatial splits. "best" is the better of "embree" and "embree high" in each
+turn. "embree packets" are of 16 rays, of the tree that serves them better; ours are single rays.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any, TypeVar
@@ -21,6 +23,8 @@ from warp_gi import launch
 from warp_gi.bench.harness import scenes
 from warp_gi.bench.harness.measure import Row, attempt, median_and_spread, ratio_and_spread, take_turns
 from warp_gi.bench.harness.places import PLACES, Place
+from warp_gi.bench.suites.rays import embree
+from warp_gi.bench.suites.rays.embree import EmbreeScene
 from warp_gi.bench.suites.rays.kernels import warp_any, warp_closest
 from warp_gi.bvh import TriangleBvh
 from warp_gi.scene.camera import CameraKey
@@ -32,7 +36,13 @@ QUICK_RAYS = 200_000
 QUICK_SCENES = ("living room", "sponza", "atrium")
 NEVER = 1 << 62
 NO_EMBREE = "embreex is not installed: pip install embreex"
-EMBREE = {"embree": False, "embree robust": True}
+EMBREE = {"embree": ("medium", False), "embree robust": ("medium", True), "embree high": ("high", False)}
+"""Embree's trees by their names in rows: quality and whether edges are watertight."""
+FAST = ("embree", "embree high")
+COHERENT = ("primary", "shadow")
+"""Kinds of rays that packets are for."""
+Batch = tuple[np.ndarray, np.ndarray, Any]
+"""Origins and directions, float32 [ray, 3], and t_max, a number or float32 [ray]."""
 CASES = {
     "living room": "living_room",
     "sponza": "sponza",
@@ -40,6 +50,9 @@ CASES = {
     "dragon": "dragon_white",
     "atrium": "atrium",
     "street": "street",
+    "modern hall": "modern_hall",
+    "warehouse": "warehouse",
+    "mine": "mine",
 }
 """Places by their names in rows; primary rays are those of their cameras."""
 PARTS = CASES
@@ -64,7 +77,10 @@ def scene_rows(name: str, quick: bool, device: str) -> list[Row]:
         return [{"scene": name, "skipped": place.missing}]
     points, indices = load_triangles(place)
     count = QUICK_RAYS if quick else RAYS
-    rays = {"diffuse": diffuse_rays(points, indices, count), "primary": primary_rays(place.path().keys[0], count)}
+    camera = place.path().keys[0]
+    primary = primary_rays(camera, count)
+    rays: dict[str, Batch] = {"diffuse": (*diffuse_rays(points, indices, count), np.inf), "primary": (*primary, np.inf)}
+    rays["shadow"] = shadow_rays(TriangleBvh(points, indices), camera, *primary)
     return compare(name, points, indices, rays, device, 3 if quick else REPETITIONS)
 
 
@@ -72,11 +88,11 @@ def compare(
     name: str,
     points: np.ndarray,
     indices: np.ndarray,
-    batches: dict[str, tuple[np.ndarray, np.ndarray]],
+    batches: Mapping[str, Batch],
     device: str = "cpu",
     repetitions: int = REPETITIONS,
 ) -> list[Row]:
-    """Return the rows of one mesh: float32 [vertex, 3] points, int32 [triangle, 3], batches of origins, directions."""
+    """Return the rows of one mesh: float32 [vertex, 3] points, int32 [triangle, 3], batches of rays by kind."""
     found = launch.get_device(device)
     threads = launch.thread_count()
     try:
@@ -85,12 +101,14 @@ def compare(
         rows = [row]
         if not peers:
             rows.append({"table": "builds", "scene": name, "skipped": NO_EMBREE})
-        for kind, (origins, directions) in batches.items():
-            for query in ("any", "closest"):
+        for kind, rays in batches.items():
+            for query in ("any",) if kind == "shadow" else ("any", "closest"):
                 row = {"table": "rays", "scene": name, "triangles": len(indices), "rays": kind, "query": query}
-                row |= race(query, tree, mesh, peers, origins, directions, repetitions)
+                row |= race(query, tree, mesh, peers, rays, repetitions, kind in COHERENT)
+                if found.is_cpu:
+                    row |= presorted(query, tree, peers, rays, repetitions)
                 if found.is_cpu and threads > 1:
-                    row |= scaling(tree, query, origins, directions, repetitions)
+                    row |= scaling(tree, query, rays, repetitions)
                 rows.append(row)
     finally:
         launch.set_threads(threads)
@@ -106,7 +124,7 @@ def build_all(name: str, points: np.ndarray, indices: np.ndarray, device: str, r
         "warp": lambda: warp_mesh(points, indices, device),
     }
     with suppress(ImportError):
-        builders |= {name: embree_builder(points, indices, robust) for name, robust in EMBREE.items()}
+        builders |= {name: embree.builder(points, indices, *kind) for name, kind in EMBREE.items()}
     turns = {name: _ignoring(build) for name, build in builders.items()}
     built = take_turns(turns, min(repetitions, 3), device, 1, host=EMBREE)
     for key, taken in built.items():
@@ -149,65 +167,93 @@ def race(
     query: str,
     tree: TriangleBvh,
     mesh: wp.Mesh,
-    peers: dict[str, tuple],
-    origins: np.ndarray,
-    directions: np.ndarray,
+    peers: Mapping[str, EmbreeScene],
+    rays: Batch,
     repetitions: int,
+    packets: bool = False,
 ) -> Row:
     """Return million rays a second of each contender and their ratios; agreement is of the hit or of the face."""
-    device = tree.device
-    runners: dict[str, Callable[[], np.ndarray]] = {"ours": lambda: trace(tree, query, origins, directions)}
-
-    def in_order() -> np.ndarray:
-        saved = bvh_module.ORDERED_RAYS
-        bvh_module.ORDERED_RAYS = NEVER
-        try:
-            return trace(tree, query, origins, directions)
-        finally:
-            bvh_module.ORDERED_RAYS = saved
-
-    runners["ours in order"] = in_order
-    name = "OCCLUDED" if query == "any" else "INTERSECT"
-    for key, (scene, _) in peers.items():
-        runners[key] = partial(scene.run, origins, directions, query=name)
-
-    def warp_query() -> np.ndarray:
-        rays: list[wp.array] = [wp.array(x, dtype=wp.vec3, device=device, copy=False) for x in (origins, directions)]
-        faces = wp.empty(len(origins), dtype=wp.int32, device=device)
-        kernel = warp_any if query == "any" else warp_closest
-        launch.launch(kernel, len(origins), [mesh.id, *rays, faces], device)
-        return faces.numpy()
-
-    runners["warp"] = warp_query
+    device, count = tree.device, len(rays[0])
+    runners: dict[str, Callable[[], np.ndarray]] = {
+        "ours": lambda: trace(tree, query, *rays),
+        "ours in order": lambda: in_order(tree, query, *rays),
+    }
+    runners |= {key: partial(scene.trace, query, *rays) for key, scene in peers.items()}
+    wide = [f"packets of {key}" for key in FAST if packets and key in peers]
+    runners |= {key: partial(peers[key.removeprefix("packets of ")].trace, query, *rays, True) for key in wide}
+    if np.ndim(rays[2]) == 0:
+        runners["warp"] = lambda: warp_query(mesh, query, device, *rays[:2])
     turns = {name: _ignoring(run) for name, run in runners.items()}
-    taken = take_turns(turns, repetitions, device.alias, 1, host=EMBREE)
-    rates = {name: [len(origins) / seconds / 1e6 for seconds in one.counting] for name, one in taken.items()}
+    taken = take_turns(turns, repetitions, device.alias, 1, host=[*EMBREE, *wide])
+    rates = {name: [count / seconds / 1e6 for seconds in one.counting] for name, one in taken.items()}
+    if peers:
+        rates["best"] = np.max([rates[name] for name in FAST], axis=0).tolist()
+    if wide:
+        rates["embree packets"] = np.max([rates.pop(name) for name in wide], axis=0).tolist()
     row: Row = {}
     for key, values in rates.items():
-        row |= median_and_spread(f"{key} Mrays/s", values)
-    for key in (*peers, "warp"):
+        if key != "best":
+            row |= median_and_spread(f"{key} Mrays/s", values)
+    for key in rates.keys() - {"ours", "ours in order"}:
         row |= ratio_and_spread(f"ours / {key}", rates["ours"], rates[key])
-        row |= ratio_and_spread(f"in order / {key}", rates["ours in order"], rates[key])
-    row["ours Mrays/wall s"] = len(origins) / taken["ours"].times[0] / 1e6
+        if key != "embree packets":
+            row |= ratio_and_spread(f"in order / {key}", rates["ours in order"], rates[key])
+    row["ours Mrays/wall s"] = count / taken["ours"].times[0] / 1e6
     if peers:
-        found, faces = (taken[name].results[0] for name in ("embree", "ours"))
-        row["agree"] = float(((found == 0 if query == "any" else found) == faces).mean())
+        row["agree"] = float((taken["embree"].results[0] == taken["ours"].results[0]).mean())
     return row
 
 
-def trace(tree: TriangleBvh, query: str, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def in_order(tree: TriangleBvh, query: str, origins: np.ndarray, directions: np.ndarray, t_max: Any) -> np.ndarray:
+    """Return ``trace`` of the rays as they come."""
+    saved = bvh_module.ORDERED_RAYS
+    bvh_module.ORDERED_RAYS = NEVER
+    try:
+        return trace(tree, query, origins, directions, t_max)
+    finally:
+        bvh_module.ORDERED_RAYS = saved
+
+
+def presorted(query: str, tree: TriangleBvh, peers: Mapping[str, EmbreeScene], rays: Batch, repetitions: int) -> Row:
+    """Return million rays a second where both get in Morton order what a batch brings into it; else nothing."""
+    order = tree._rays(*rays).order
+    if not peers or order is None or not len(order):
+        return {}
+    taking = order.numpy()
+    given: Batch = (rays[0][taking], rays[1][taking], rays[2][taking] if np.ndim(rays[2]) else rays[2])
+    runners = {"ours presorted": lambda: in_order(tree, query, *given)}
+    runners |= {f"{key} presorted": partial(peers[key].trace, query, *given) for key in FAST}
+    taken = take_turns({name: _ignoring(run) for name, run in runners.items()}, repetitions)
+    rates = {name: [len(taking) / seconds / 1e6 for seconds in one.cpu] for name, one in taken.items()}
+    best = np.max([rates.pop(f"{key} presorted") for key in FAST], axis=0).tolist()
+    row = median_and_spread("ours presorted Mrays/s", rates["ours presorted"])
+    row |= median_and_spread("embree presorted Mrays/s", best)
+    return row | ratio_and_spread("presorted / best", rates["ours presorted"], best)
+
+
+def warp_query(mesh: wp.Mesh, query: str, device: wp.Device, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return what Warp's own query finds, as ``trace``."""
+    rays: list[wp.array] = [wp.array(x, dtype=wp.vec3, device=device, copy=False) for x in (origins, directions)]
+    faces = wp.empty(len(origins), dtype=wp.int32, device=device)
+    launch.launch(warp_any if query == "any" else warp_closest, len(origins), [mesh.id, *rays, faces], device)
+    return faces.numpy()
+
+
+def trace(
+    tree: TriangleBvh, query: str, origins: np.ndarray, directions: np.ndarray, t_max: Any = np.inf
+) -> np.ndarray:
     """Return 0 or 1 (any) or the face (closest) for each ray."""
     if query == "any":
-        return tree.occluded(origins, directions).numpy()
-    return tree.intersect(origins, directions).face.numpy()
+        return tree.occluded(origins, directions, t_max).numpy()
+    return tree.intersect(origins, directions, t_max).face.numpy()
 
 
-def scaling(tree: TriangleBvh, query: str, origins: np.ndarray, directions: np.ndarray, repetitions: int) -> Row:
+def scaling(tree: TriangleBvh, query: str, rays: Batch, repetitions: int) -> Row:
     """Return what two threads do to wall time and to CPU time."""
 
     def with_threads(count: int, turn: int) -> None:
         launch.set_threads(count)
-        trace(tree, query, origins, directions)
+        trace(tree, query, *rays)
 
     taken = take_turns({str(count): partial(with_threads, count) for count in (1, 2)}, repetitions)
     launch.set_threads(1)
@@ -257,3 +303,19 @@ def primary_rays(case: CameraKey, count: int) -> tuple[np.ndarray, np.ndarray]:
     directions = forward + x[..., None] * right * side + y[..., None] * right * height / width * up
     directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).reshape(-1, 3).astype(np.float32)
     return np.tile(np.asarray(case.eye, np.float32), (len(directions), 1)), directions
+
+
+def shadow_rays(tree: TriangleBvh, camera: CameraKey, origins: np.ndarray, directions: np.ndarray) -> Batch:
+    """Return rays from what camera rays hit to a point light, with limits, both ends just off.
+
+    The light is half way from the camera to the mean of the hits, so that much of what is seen lies in its shadow.
+    """
+    t = tree.intersect(origins, directions).t.numpy()
+    hit = np.isfinite(t)
+    points = origins[hit] + t[hit, None].astype(np.float64) * directions[hit]
+    light = (np.asarray(camera.eye) + points.mean(axis=0)) / 2.0
+    away = light - points
+    distance = np.linalg.norm(away, axis=1, keepdims=True)
+    away /= np.maximum(distance, 1e-30)
+    start = points + 1e-4 * distance * away
+    return start.astype(np.float32), away.astype(np.float32), (0.9998 * distance[:, 0]).astype(np.float32)
