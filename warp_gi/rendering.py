@@ -16,8 +16,9 @@ from warp_gi.pipeline import DEFAULT, Pipeline
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.sky_motion import sky_start
 from warp_gi.scheduler import FrameScheduler
+from warp_gi.sequence.chunks import chunk_of, run_of
 from warp_gi.sequence.frame_time import check_seconds, samples_within, take_time
-from warp_gi.sequence.resume import Output, Plan, SequenceRun, shots_of
+from warp_gi.sequence.resume import Output, Plan, shots_of
 from warp_gi.stateful import Stateful
 
 if TYPE_CHECKING:
@@ -45,6 +46,8 @@ def render(
     exposure: float = 0.0,
     frame_time: float | None = None,
     cache: BakeFolder | str | Path | None = None,
+    chunk: str | tuple[int, int] | None = None,
+    warm_up: int | None = None,
 ) -> Iterator[Frame]:
     """Yield the frames of a sequence, and write them to files if there is an ``output``.
 
@@ -78,14 +81,22 @@ def render(
             first frame may take more (``SpatioTemporal.first_samples``). None takes those of the pipeline.
         cache: Folder in which bakes that take long are kept, and found the next time, or a ``gi.BakeFolder``, which the
             command uses. The frames are the same to the last bit. None keeps none.
+        chunk: A part of the frames, as "3/16" or (3, 16), for several processes with one ``output``: every sixteenth
+            frame where frames are independent, else a run of frames. Each has the bits that one process would give it.
+            What a run needs of the frames before it is read from another part's state file, or rendered anew.
+        warm_up: Number of frames before a part that are rendered and thrown away in place of all of them, where frames
+            depend on those before. That is not exact: files say so (``warm_up``, ``measured/warm_up_error``).
 
     Raises OptionError for a device that is not there, a negative frame or seed, files that frames cannot be, several
     frames for one file, or files that another process is writing; BakeError for a bake of another scene or other
     settings; SceneError for a scene that was edited so that pictures would not show it; OSError for files that cannot
     be written.
     """
-    if output is None and (resume or preview or exposure or precision != "half"):
-        raise OptionError('resume, precision, preview and exposure are of files; give output="out/shot.####.exr" too')
+    if output is None and (resume or preview or exposure or precision != "half" or chunk):
+        raise OptionError(
+            'resume, precision, preview, exposure and chunk are of files; give output="out/shot.####.exr" too'
+        )
+    part = chunk_of(chunk, warm_up, frame_time)
     if frame_time is not None:
         check_seconds(frame_time)
     wanted = _frame_numbers(camera, frames)
@@ -106,12 +117,13 @@ def render(
     shots = [shot for shot in shots_of(camera, wanted, files.pattern) if shot.index not in skip]
     if not shots:
         return
-    run = SequenceRun(scheduler, shots, files)
+    run = run_of(scheduler, shots, files, part)
     if frame_time is not None:
         take_time(run, frame_time, resume)
     plan = run.plan(resume)
     try:
         run.prepare(plan)
+        run.lead()
         for shot in plan.todo:
             frame = run.render(shot)
             run.save_state(shot, frame)
@@ -135,6 +147,8 @@ def plan_sequence(
     precision: Literal["half", "float"] = "half",
     frame_time: float | None = None,
     cache: BakeFolder | str | Path | None = None,
+    chunk: str | tuple[int, int] | None = None,
+    warm_up: int | None = None,
 ) -> Plan:
     """Return what ``render`` with these arguments and ``resume=True`` would render, and why; nothing is written.
 
@@ -143,13 +157,14 @@ def plan_sequence(
     tells with which bake it was made: give ``bakes`` to do so once. Arguments and errors are those of ``render``;
     the scene is left under the sky of the last frame.
     """
+    part = chunk_of(chunk, warm_up, frame_time)
     wanted = _frame_numbers(camera, frames)
     scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, progress, bakes, cache)
     files = Output(Path(output), precision)
     shots = shots_of(scheduler.camera, wanted, files.pattern)
     if not shots:
         return Plan((), ())
-    run = SequenceRun(scheduler, shots, files)
+    run = run_of(scheduler, shots, files, part)
     if frame_time is not None:
         take_time(run, frame_time, resume=True)
     return run.plan()

@@ -35,6 +35,7 @@ from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.scene import Scene
 from warp_gi.scheduler import FrameScheduler
+from warp_gi.sequence.chunks import chunk_of, run_of
 from warp_gi.sequence.frame_time import parse_seconds, take_time
 from warp_gi.sequence.frames import parse_frames
 from warp_gi.sequence.resume import Output, Plan, SequenceRun, Shot, shots_of
@@ -78,6 +79,10 @@ class Render(SceneOptions):
     """Angle in degrees by which the sky turns from frame to frame, as --environment-rotation does."""
     frames: Annotated[str, flag("LIST", "every frame of the path; 0 for a still camera")] = ""
     """Numbers of the frames to render: 5, 0-47, 0-47:2 or 1,4,9-12."""
+    chunk: Annotated[str, flag("I/N", "all of them")] = ""
+    """Part of these frames to render, as 3/16, beside processes that render the others to the same files."""
+    warm_up: Annotated[int | None, flag("N", "all frames before, which is exact")] = None
+    """Frames before a part that are rendered and thrown away, where frames depend on those before. Not exact."""
     resolution: Annotated[str, flag("WxH", "the camera's own")] = ""
     """Width and height of the frames in pixels, as 960x540."""
     seed: int = 1
@@ -137,6 +142,7 @@ def run(options: Render, report: Reporter) -> None:
         raise OptionError("--reuse-pixel goes with --reuse-pictures; give that too")
     resolution = parse_resolution(options.resolution) if options.resolution else None
     frame_time = parse_seconds(options.frame_time) if options.frame_time else None
+    chunk = chunk_of(options.chunk, options.warm_up, frame_time)
     output = find_output(options)
     check_targets(options)
     bakes = [load_bake(path) for path in options.bake]
@@ -161,9 +167,9 @@ def run(options: Render, report: Reporter) -> None:
         from warp_gi.techniques.reuse.pictures import check_pictures  # its kernels are not for every run
 
         check_pictures(scheduler, shots[-1].camera, options.reuse_pixel)
-    sequence = SequenceRun(scheduler, shots, output)
     with report.phase("bake"):
-        sequence.bake()
+        scheduler.bake(shots[0].time, len(shots))
+        sequence = run_of(scheduler, shots, output, chunk)
     if frame_time is not None:
         with report.phase("timing of frames"):
             samples = take_time(sequence, frame_time, options.resume)
@@ -176,11 +182,14 @@ def run(options: Render, report: Reporter) -> None:
     sequence.prepare(plan)
     started = time.perf_counter()
     try:
+        sequence.lead()
         times = render_shots(options, plan, sequence, report)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("finished frames are kept, --resume renders the others") from None
     finally:
         sequence.finish()
+    if chunk is not None and not plan.shots:
+        report.line(f"chunk {options.chunk} has no frame: there are {len(shots)} in all")
     count = f"{len(plan.todo)} frame{'s' * (len(plan.todo) != 1)}"
     report.line(f"{count} in {time.perf_counter() - started:.1f} s: {options.output}")
     if options.verbose and plan.todo:
