@@ -22,6 +22,7 @@ from warp_gi.cli.inputs import (
     parse_resolution,
 )
 from warp_gi.cli.interrupts import stoppable
+from warp_gi.cli.json_progress import JsonReporter
 from warp_gi.cli.options import flag, parse_options, value_given
 from warp_gi.cli.pipelines import find_denoiser, pipeline_named, with_settings_shared
 from warp_gi.cli.report import Reporter, run_command
@@ -109,6 +110,8 @@ class Render(SceneOptions):
     shares of exploration and of the BSDF. The pipeline has to learn, as reuse and hybrid do."""
     reuse_pixel: Annotated[tuple[int, int] | None, flag("X Y", "none")] = None
     """Pixel x y whose quadtree to draw, beside the light that comes to the point seen there. 0 0 is at the top left."""
+    json_progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print one JSON object a finished frame on stdout, for programs; other lines go to stderr."""
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print nothing but errors."""
     verbose: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -118,7 +121,8 @@ class Render(SceneOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Run the command."""
-    return run_command(parse(arguments), run)
+    options = parse(arguments)
+    return run_command(options, run, JsonReporter if options.json_progress else None)
 
 
 def parse(arguments: Sequence[str]) -> Render:
@@ -265,5 +269,5 @@ def render_shot(shot: Shot, sequence: SequenceRun, report: Reporter) -> tuple[Fr
     compiled = launch.compile_seconds - compiled
     seconds = time.perf_counter() - started - compiled
     note = f" and {compiled:.1f} s compiling kernels" if compiled > 0.5 else ""
-    report.frame(f"{shot.path} {seconds:.2f} s{note}", seconds)
+    report.frame(f"{shot.path} {seconds:.2f} s{note}", seconds, shot.index, shot.path)
     return frame, frame.timings
