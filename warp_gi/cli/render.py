@@ -84,6 +84,8 @@ class Render(SceneOptions):
     """Part of these frames to render, as 3/16, beside processes that render the others to the same files."""
     warm_up: Annotated[int | None, flag("N", "all frames before, which is exact")] = None
     """Frames before a part that are rendered and thrown away, where frames depend on those before. Not exact."""
+    cluster: Annotated[str, flag("ADDRESS", "this process renders")] = ""
+    """Dask scheduler, as tcp://10.0.0.1:8786, whose workers render. All see the scene's files and OUTPUT's folder."""
     resolution: Annotated[str, flag("WxH", "the camera's own")] = ""
     """Width and height of the frames in pixels, as 960x540."""
     seed: int = 1
@@ -147,6 +149,8 @@ def run(options: Render, report: Reporter) -> None:
     resolution = parse_resolution(options.resolution) if options.resolution else None
     frame_time = parse_seconds(options.frame_time) if options.frame_time else None
     chunk = chunk_of(options.chunk, options.warm_up, frame_time)
+    if options.cluster and (chunk or frame_time or options.reuse_pictures):
+        raise OptionError("--cluster goes without --chunk, --frame-time and --reuse-pictures; leave them out")
     output = find_output(options)
     check_targets(options)
     bakes = [load_bake(path) for path in options.bake]
@@ -162,10 +166,10 @@ def run(options: Render, report: Reporter) -> None:
     shots = find_shots(options, camera)
     if isinstance(scene, Scene):
         move_sky(scene, options.environment_turn, camera, [shot.index for shot in shots])
-    source = scene.bake if isinstance(scene, BakedScene) else scene
+    shown = scene.bake if isinstance(scene, BakedScene) else scene
     cache = BakeFolder() if options.cache else None
     scheduler = FrameScheduler(
-        source, camera, options.settings, options.device, options.seed, report.stage, bakes, cache
+        shown, camera, options.settings, options.device, options.seed, report.stage, bakes, cache
     )
     if options.reuse_pictures is not None:
         from warp_gi.techniques.reuse.pictures import check_pictures  # its kernels are not for every run
@@ -186,8 +190,17 @@ def run(options: Render, report: Reporter) -> None:
     sequence.prepare(plan)
     started = time.perf_counter()
     try:
-        sequence.lead()
-        times = render_shots(options, plan, sequence, report)
+        times: dict[str, list[float]] = {}
+        if options.cluster:
+            if plan.todo:
+                from warp_gi.cli.cluster import render_on_cluster, scene_by_path
+
+                source = scene_by_path(options, options.environment_turn, sequence)
+                of_run = cache, options.resume, plan, sequence, report
+                render_on_cluster(options.cluster, source, options.bake, *of_run)
+        else:
+            sequence.lead()
+            times = render_shots(options, plan, sequence, report)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("finished frames are kept, --resume renders the others") from None
     finally:
@@ -196,7 +209,7 @@ def run(options: Render, report: Reporter) -> None:
         report.line(f"chunk {options.chunk} has no frame: there are {len(shots)} in all")
     count = f"{len(plan.todo)} frame{'s' * (len(plan.todo) != 1)}"
     report.line(f"{count} in {time.perf_counter() - started:.1f} s: {options.output}")
-    if options.verbose and plan.todo:
+    if options.verbose and times:
         times["bake"] = times["bake"][:1]  # every frame names the one bake
         rows = [(stage, *(f"{x:.3f}" for x in (v[0], sum(v) / len(v), max(v), sum(v)))) for stage, v in times.items()]
         report.table("seconds by stage", ("stage", "first frame", "mean", "largest", "sum"), rows)

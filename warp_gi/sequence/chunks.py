@@ -137,7 +137,7 @@ class PartRun(SequenceRun):
             problems = self._problems(own, resume)
             return Plan(tuple(own), tuple(shot for shot in own if not resume or shot.index in problems), problems)
         begin = self._begin
-        line = self._with_lineages(self.shots[begin : places.stop])
+        line = self.with_lineages(self.shots[begin : places.stop])
         before, own = line[: places.start - begin], line[places.start - begin :]
         problems = self._problems(own, resume)
         gap = next((place for place, shot in enumerate(own) if not resume or shot.index in problems), None)

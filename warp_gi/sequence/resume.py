@@ -191,6 +191,8 @@ class SequenceRun:
     def __init__(self, scheduler: FrameScheduler, shots: Sequence[Shot], output: Output) -> None:
         self.scheduler, self.shots, self.output = scheduler, tuple(shots), output
         self._claim: Claim | None = None
+        self.since = 0
+        """Time in ns, by the clock of the disk, from which on files are kept by a resumed run; 0 is any time."""
 
     def bake(self) -> None:
         """Bake under the sky of the sequence's first frame, so that a resumed sequence has the same bake."""
@@ -209,7 +211,7 @@ class SequenceRun:
         Without ``resume`` that is every frame. Raises OptionError for files that do not say how they were made.
         """
         self._check_resumable(resume)
-        dependence, shots = self.dependence, self._with_lineages(self.shots)
+        dependence, shots = self.dependence, self.with_lineages(self.shots)
         problems = self._problems(shots, resume)
         if not resume:
             return Plan(tuple(shots), tuple(shots), dependence=dependence)
@@ -226,7 +228,7 @@ class SequenceRun:
         if resume and not self.output.is_exr:
             raise OptionError("resume needs .exr files, which say how they were made; a .png does not")
 
-    def _with_lineages(self, shots: Sequence[Shot]) -> list[Shot]:
+    def with_lineages(self, shots: Sequence[Shot]) -> list[Shot]:
         """Return frames that follow each other with their lineages, where they depend on those before."""
         found, lineage = [], ""
         for shot in shots:
@@ -240,7 +242,7 @@ class SequenceRun:
         """Return why files cannot be kept, by frame number; nothing without ``resume``, which keeps none."""
         if not resume:
             return {}
-        found = {shot.index: why_not_whole(shot.path, self._attributes(shot), shot.camera) for shot in shots}
+        found = {shot.index: self.problem(shot) for shot in shots}
         problems = {index: problem for index, problem in found.items() if problem is not None}
         for shot in shots:
             if problems.get(shot.index, MISSING) != MISSING:
@@ -284,7 +286,14 @@ class SequenceRun:
 
     def is_done(self, shot: Shot) -> bool:
         """Return whether the file of a frame is whole, and as this run would write it."""
-        return why_not_whole(shot.path, self._attributes(shot), shot.camera) is None
+        return self.problem(shot) is None
+
+    def problem(self, shot: Shot) -> str | None:
+        """Return why the file of a frame cannot be kept, in a few words; None if it can."""
+        found = why_not_whole(shot.path, self._attributes(shot), shot.camera)
+        if found is None and shot.path.stat().st_mtime_ns < self.since:
+            return "of an earlier run"
+        return found
 
     def render(self, shot: Shot) -> Frame:
         """Render a frame of the plan's ``todo`` and write its file; the time it took is the frame's timing "write"."""
