@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import subprocess
 import sys
@@ -190,13 +191,35 @@ def test_whatever_a_command_lets_out_is_one_line(monkeypatch, capfd, command, fa
 
     monkeypatch.setattr(module, "main", fails)
     monkeypatch.delenv("WARP_GI_DEBUG", raising=False)
-    assert cli.main([command]) == 2
+    assert cli.main([command]) == 1
     said = capfd.readouterr().err
     assert said.startswith("warp-gi: error: a fault of warp-gi, please report it (" + type(fault).__name__)
     assert said.count("\n") == 1 and "WARP_GI_DEBUG=1" in said
     monkeypatch.setenv("WARP_GI_DEBUG", "1")
     with pytest.raises(type(fault)):
         cli.main([command])
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (OptionError("a setting"), 2),
+        (PermissionError(errno.EACCES, "may not be written", "a.exr"), 2),
+        (OSError(errno.ENOSPC, "no space left", "a.exr"), 1),
+        (OSError("cannot write a.exr: unknown failure"), 1),
+        (MemoryError(), 1),
+    ],
+    ids=repr,
+)
+def test_exit_codes_tell_mistakes_from_failures(error, code, monkeypatch, capfd):
+    """A job scheduler tries again what failed, and leaves alone what can never be."""
+
+    def fails(arguments):
+        raise error
+
+    monkeypatch.setattr("warp_gi.cli.render.main", fails)
+    assert cli.main(["render"]) == code
+    assert capfd.readouterr().err.count("\n") == 1
 
 
 def test_an_exposure_is_checked_where_pictures_are_made():

@@ -173,6 +173,21 @@ def load_bake(path: str | Path) -> Bake:
         raise _damaged(path) from error
 
 
+def settings_in(path: str | Path) -> dict[str, Setting]:
+    """Return the settings that a bake file names, without its arrays; ``load_bake`` checks that it is whole.
+
+    Raises BakeError when the file is no bake, or damaged at its beginning.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    path = user_path(path)
+    try:
+        with safe_open(path, framework="np") as file:
+            return dict(_record(path, file.metadata() or {})["settings"])
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+        raise _damaged(path) from error
+
+
 def _are(values: Mapping[str, Any], kinds: Any) -> bool:
     """Return whether all values are of some kinds, and finite."""
     return all(

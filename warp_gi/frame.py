@@ -123,6 +123,8 @@ class Frame:
         """
         self.metadata: dict[str, str | int | float] = {}
         """Values by name that decide the pixels, beside camera and time."""
+        self.measured: dict[str, float] = {}
+        """Values by name that tell of the pixels and do not decide them; files have them too."""
         self.paths = PathRequest(data.emitters)
         """Requests of estimators to the path tracer."""
         self.pipeline_samples = settings.spp
@@ -168,7 +170,7 @@ class Frame:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy has: pixels and what describes them, but no scene and nothing on a device."""
-        values = {name: getattr(self, name) for name in (*_COPIED, "timings", "metadata")}
+        values = {name: getattr(self, name) for name in (*_COPIED, "timings", "metadata", "measured")}
         return values | {"_arrays": {name: self.numpy(name) for name in self.names}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -356,3 +358,12 @@ def timed(timings: dict[str, float], name: str, device: wp.Device) -> Iterator[N
     compiled = launch.compile_seconds - timings["compile"] - compiled
     timings["compile"] += compiled
     timings[name] = timings.get(name, 0.0) + time.perf_counter() - started - compiled - others
+
+
+def mixed_seed(seed: int, frame: int) -> int:
+    """Return a well-mixed 32-bit seed of a frame (splitmix64)."""
+    mask = (1 << 64) - 1
+    z = (seed * 0x9E3779B97F4A7C15 + frame * 0xD1B54A32D192ED03 + 0x9E3779B97F4A7C15) & mask
+    z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) & mask
+    z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & mask
+    return (z ^ (z >> 31)) & 0xFFFFFFFF

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, cast
 
 from warp_gi import launch
 from warp_gi.baking import Bake
+from warp_gi.cluster.engine import frames_on, job_of
+from warp_gi.cluster.job import SceneAsItIs
 from warp_gi.errors import OptionError, whole_number
 from warp_gi.estimator import Estimator
 from warp_gi.foretold import kernels_of
@@ -16,6 +18,7 @@ from warp_gi.pipeline import DEFAULT, Pipeline
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.sky_motion import sky_start
 from warp_gi.scheduler import FrameScheduler
+from warp_gi.sequence.chunks import chunk_of, run_of
 from warp_gi.sequence.frame_time import check_seconds, samples_within, take_time
 from warp_gi.sequence.resume import Output, Plan, SequenceRun, shots_of
 from warp_gi.stateful import Stateful
@@ -45,6 +48,9 @@ def render(
     exposure: float = 0.0,
     frame_time: float | None = None,
     cache: BakeFolder | str | Path | None = None,
+    chunk: str | tuple[int, int] | None = None,
+    warm_up: int | None = None,
+    cluster: object = None,
 ) -> Iterator[Frame]:
     """Yield the frames of a sequence, and write them to files if there is an ``output``.
 
@@ -78,14 +84,28 @@ def render(
             first frame may take more (``SpatioTemporal.first_samples``). None takes those of the pipeline.
         cache: Folder in which bakes that take long are kept, and found the next time, or a ``gi.BakeFolder``, which the
             command uses. The frames are the same to the last bit. None keeps none.
+        chunk: A part of the frames, as "3/16" or (3, 16), for several processes with one ``output``: every sixteenth
+            frame where frames are independent, else a run of frames. Each has the bits that one process would give it.
+            What a run needs of the frames before it is read from another part's state file, or rendered anew.
+        warm_up: Number of frames before a part that are rendered and thrown away in place of all of them, where frames
+            depend on those before. That is not exact: files say so (``warm_up``, ``measured/warm_up_error``).
+        cluster: A ``distributed.Client``, or the address of a Dask scheduler, whose workers render and write the files;
+            all see the folder of ``output``. What is yielded then are ``FrameFile``s, in order, as read from the files.
+            Frames are equal, bit for bit, to those of this process.
 
     Raises OptionError for a device that is not there, a negative frame or seed, files that frames cannot be, several
     frames for one file, or files that another process is writing; BakeError for a bake of another scene or other
     settings; SceneError for a scene that was edited so that pictures would not show it; OSError for files that cannot
     be written.
     """
-    if output is None and (resume or preview or exposure or precision != "half"):
-        raise OptionError('resume, precision, preview and exposure are of files; give output="out/shot.####.exr" too')
+    if output is None and (resume or preview or exposure or precision != "half" or chunk or cluster):
+        raise OptionError(
+            'resume, precision, preview, exposure, chunk and cluster are of files; give output="out/shot.####.exr" too'
+        )
+    if cluster is not None and (chunk or frame_time is not None):
+        raise OptionError("a cluster hands out whole sequences of a number of samples; leave chunk and frame_time out")
+    bakes = tuple(bakes)
+    part = chunk_of(chunk, warm_up, frame_time)
     if frame_time is not None:
         check_seconds(frame_time)
     wanted = _frame_numbers(camera, frames)
@@ -106,12 +126,16 @@ def render(
     shots = [shot for shot in shots_of(camera, wanted, files.pattern) if shot.index not in skip]
     if not shots:
         return
-    run = SequenceRun(scheduler, shots, files)
+    run = run_of(scheduler, shots, files, part)
     if frame_time is not None:
         take_time(run, frame_time, resume)
     plan = run.plan(resume)
     try:
         run.prepare(plan)
+        if cluster is not None:
+            yield from _on_cluster(cluster, run, plan, SceneAsItIs(scene), bakes, cache, resume)
+            return
+        run.lead()
         for shot in plan.todo:
             frame = run.render(shot)
             run.save_state(shot, frame)
@@ -119,6 +143,19 @@ def render(
             del frame  # before there is a next one
     finally:
         run.finish()
+
+
+def _on_cluster(
+    cluster: object,
+    run: SequenceRun,
+    plan: Plan,
+    scene: SceneAsItIs,
+    bakes: Sequence[Bake],
+    cache: BakeFolder | str | Path | None,
+    resume: bool,
+) -> Iterator[Frame]:
+    frames = frames_on(cluster, run, plan, job_of(run, plan, scene, bakes, cache, resume)) if plan.todo else ()
+    yield from cast("Iterator[Frame]", frames)
 
 
 def plan_sequence(
@@ -135,6 +172,8 @@ def plan_sequence(
     precision: Literal["half", "float"] = "half",
     frame_time: float | None = None,
     cache: BakeFolder | str | Path | None = None,
+    chunk: str | tuple[int, int] | None = None,
+    warm_up: int | None = None,
 ) -> Plan:
     """Return what ``render`` with these arguments and ``resume=True`` would render, and why; nothing is written.
 
@@ -143,13 +182,14 @@ def plan_sequence(
     tells with which bake it was made: give ``bakes`` to do so once. Arguments and errors are those of ``render``;
     the scene is left under the sky of the last frame.
     """
+    part = chunk_of(chunk, warm_up, frame_time)
     wanted = _frame_numbers(camera, frames)
     scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, progress, bakes, cache)
     files = Output(Path(output), precision)
     shots = shots_of(scheduler.camera, wanted, files.pattern)
     if not shots:
         return Plan((), ())
-    run = SequenceRun(scheduler, shots, files)
+    run = run_of(scheduler, shots, files, part)
     if frame_time is not None:
         take_time(run, frame_time, resume=True)
     return run.plan()

@@ -20,7 +20,7 @@ from warp_gi.denoise import Denoiser
 from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.forecast import tell_cost
-from warp_gi.frame import Frame, timed
+from warp_gi.frame import Frame, mixed_seed, timed
 from warp_gi.kept import BakeFolder, cached_bake
 from warp_gi.kernels import compose, types
 from warp_gi.pipeline import DENOISER, Pipeline
@@ -116,6 +116,14 @@ class FrameScheduler:
         self._sky_time = sky_start(self.scene.sky_at)
         self._scene_hash = ""
         self._frame_time: float | None = None
+
+    def __copy__(self) -> FrameScheduler:
+        """Return one that goes on from the same states; what either renders changes nothing in the other."""
+        other = object.__new__(type(self))
+        other.__dict__ |= self.__dict__
+        for name in ("_states", "_keys", "_bake_digests", "_made"):
+            setattr(other, name, dict(getattr(self, name)))
+        return other
 
     # ---- before the first frame ----
 
@@ -266,8 +274,6 @@ class FrameScheduler:
         """
         self.bake()
         other = copy.copy(self)
-        other._states, other._keys = dict(self._states), dict(self._keys)
-        other._bake_digests, other._made = dict(self._bake_digests), dict(self._made)
         other._progress = lambda stage, share: None
         other.camera = self.camera.at_resolution(*resolution)
         other.take_samples(spp)
@@ -283,7 +289,7 @@ class FrameScheduler:
         if self.scene.emitter_count:
             data.emitters.alias = whole_scene(self.scene).light_table(self.device)
         cameras = self._camera_at(index), self._camera_at(previous_index)
-        settings, seed = self.pipeline.frame_settings, _mix(self.seed, index)
+        settings, seed = self.pipeline.frame_settings, mixed_seed(self.seed, index)
         frame = Frame(self.scene, data, *cameras, settings, self.device, index, now, seed, previous_index)
         frame.estimators = dict(self.pipeline.estimators())
         frame.has_camera_rays = isinstance(self.pipeline.primary()[1], CameraRays)
@@ -388,12 +394,3 @@ def _bakes_by_class(bakes: Iterable[Bake], parts: dict[str, Stateful]) -> dict[s
             )
         found[one.technique].append(one)
     return found
-
-
-def _mix(seed: int, frame: int) -> int:
-    """Return a well-mixed 32-bit seed of a frame (splitmix64)."""
-    mask = (1 << 64) - 1
-    z = (seed * 0x9E3779B97F4A7C15 + frame * 0xD1B54A32D192ED03 + 0x9E3779B97F4A7C15) & mask
-    z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) & mask
-    z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & mask
-    return (z ^ (z >> 31)) & 0xFFFFFFFF

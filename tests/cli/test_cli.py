@@ -226,7 +226,7 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (8000, 8000))
 sys.exit(main(["render", *{SMALL!r}, "--frames=0-3", "--quiet", "-o", "a.####.exr"]))
 """
     result = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
-    assert result.returncode == 2, result
+    assert result.returncode == 1, result
     assert result.stderr.startswith("warp-gi: error: cannot write a.0000.exr: ") and result.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
@@ -342,7 +342,7 @@ def test_no_memory_is_one_line(capfd, monkeypatch):
         raise RuntimeError("Failed to allocate 768000000000 bytes on device 'cpu'")
 
     monkeypatch.setattr(cli, "_dispatch", fails)
-    assert cli.main(["info", "x"]) == 2
+    assert cli.main(["info", "x"]) == 1
     assert capfd.readouterr().err.startswith("warp-gi: error: not enough memory: Failed to allocate 768")
 
 

@@ -274,7 +274,7 @@ def test_the_command_and_python_go_on_with_each_other(tmp_path):
     "arguments, words",
     [
         ({"resume": True}, 'give output="out/shot.####.exr" too'),
-        ({"preview": True}, "resume, precision, preview and exposure are of files"),
+        ({"preview": True}, "resume, precision, preview, exposure, chunk and cluster are of files"),
         ({"output": "a.exr"}, "2 frames cannot all go to a.exr; put #### in the name"),
         ({"output": "a.#.tif"}, "cannot write a.#.tif: frames are .exr or .png files"),
         ({"output": "a.#.png", "resume": True}, "resume needs .exr files"),

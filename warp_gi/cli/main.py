@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import io
 import os
@@ -13,8 +14,13 @@ from dataclasses import dataclass
 
 from warp_gi.errors import GiError, one_line, unknown_name
 
+EXIT_FAILURE = 1
+"""A run failed through no fault of its arguments: a full disk, no memory, a fault of this program. Again may help."""
 EXIT_ERROR = 2
+"""What was asked for cannot be: another try would fail, too."""
 EXIT_INTERRUPTED = 130
+OF_MACHINE = {"ENOSPC", "EDQUOT", "EIO", "ENOMEM", "ESTALE", "EMFILE", "ENFILE", "EPIPE", "ETIMEDOUT"}
+"""Errors of the system that no argument is to blame for."""
 DEBUG = "WARP_GI_DEBUG=1 shows where it came from"
 
 
@@ -51,13 +57,13 @@ examples:
   warp-gi render out/hall.probes.safetensors         what that bake holds, without the scene
   warp-gi compare out/hall.0000.exr reference.exr    RMSE, relMSE, PSNR, FLIP and a picture of the difference
 
-`warp-gi COMMAND --help` lists the options of a command. Errors are one line on stderr and exit code 2;
-WARP_GI_DEBUG=1 shows where they came from.
+`warp-gi COMMAND --help` lists the options of a command. Errors are one line on stderr. Exit codes: 0 done, 2 what was
+asked for cannot be, 1 another failure (a full disk, no memory), 130 Ctrl-C. WARP_GI_DEBUG=1 shows where it came from.
 """
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code: 0, 2 after an error, 130 when interrupted."""
+    """Run the command line and return its exit code: 0 done, 2 a user's mistake, 1 a failure, 130 interrupted."""
     is_process = arguments is None
     if is_process:
         _open_closed_streams()
@@ -75,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if os.environ.get("WARP_GI_DEBUG", "0") != "0":
             raise
         print(f"warp-gi: error: {_message(error)}", file=sys.stderr)
-        return EXIT_ERROR
+        return EXIT_FAILURE if _is_of_machine(error) else EXIT_ERROR
     except Exception as error:
         if os.environ.get("WARP_GI_DEBUG", "0") != "0":
             raise
@@ -84,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             what = f"{type(error).__name__}: {_message(error)}".rstrip(": ")
             print(f"warp-gi: error: a fault of warp-gi, please report it ({what}); {DEBUG}", file=sys.stderr)
-        return EXIT_ERROR
+        return EXIT_FAILURE
     except KeyboardInterrupt as interrupt:
         if is_process:  # a second Ctrl-C would break off the interpreter's leaving with a traceback
             signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -120,6 +126,13 @@ def _dispatch(arguments: list[str]) -> int:
 
 def _show_warning(message: Warning | str, *where: object, **more: object) -> None:
     print(f"warp-gi: warning: {_message(message)}", file=sys.stderr)
+
+
+def _is_of_machine(error: BaseException) -> bool:
+    """Return whether another try may do better: memory or disk ran out, or a library could not write a file."""
+    if isinstance(error, OSError):
+        return error.errno is None or errno.errorcode.get(error.errno) in OF_MACHINE
+    return isinstance(error, MemoryError)
 
 
 def _message(error: BaseException | str) -> str:

@@ -22,6 +22,7 @@ from warp_gi.cli.inputs import (
     parse_resolution,
 )
 from warp_gi.cli.interrupts import stoppable
+from warp_gi.cli.json_progress import JsonReporter
 from warp_gi.cli.options import flag, parse_options, value_given
 from warp_gi.cli.pipelines import find_denoiser, pipeline_named, with_settings_shared
 from warp_gi.cli.report import Reporter, run_command
@@ -35,6 +36,7 @@ from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.scene import Scene
 from warp_gi.scheduler import FrameScheduler
+from warp_gi.sequence.chunks import chunk_of, run_of
 from warp_gi.sequence.frame_time import parse_seconds, take_time
 from warp_gi.sequence.frames import parse_frames
 from warp_gi.sequence.resume import Output, Plan, SequenceRun, Shot, shots_of
@@ -78,6 +80,12 @@ class Render(SceneOptions):
     """Angle in degrees by which the sky turns from frame to frame, as --environment-rotation does."""
     frames: Annotated[str, flag("LIST", "every frame of the path; 0 for a still camera")] = ""
     """Numbers of the frames to render: 5, 0-47, 0-47:2 or 1,4,9-12."""
+    chunk: Annotated[str, flag("I/N", "all of them")] = ""
+    """Part of these frames to render, as 3/16, beside processes that render the others to the same files."""
+    warm_up: Annotated[int | None, flag("N", "all frames before, which is exact")] = None
+    """Frames before a part that are rendered and thrown away, where frames depend on those before. Not exact."""
+    cluster: Annotated[str, flag("ADDRESS", "this process renders")] = ""
+    """Dask scheduler, as tcp://10.0.0.1:8786, whose workers render. All see the scene's files and OUTPUT's folder."""
     resolution: Annotated[str, flag("WxH", "the camera's own")] = ""
     """Width and height of the frames in pixels, as 960x540."""
     seed: int = 1
@@ -104,6 +112,8 @@ class Render(SceneOptions):
     shares of exploration and of the BSDF. The pipeline has to learn, as reuse and hybrid do."""
     reuse_pixel: Annotated[tuple[int, int] | None, flag("X Y", "none")] = None
     """Pixel x y whose quadtree to draw, beside the light that comes to the point seen there. 0 0 is at the top left."""
+    json_progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print one JSON object a finished frame on stdout, for programs; other lines go to stderr."""
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print nothing but errors."""
     verbose: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -113,7 +123,8 @@ class Render(SceneOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Run the command."""
-    return run_command(parse(arguments), run)
+    options = parse(arguments)
+    return run_command(options, run, JsonReporter if options.json_progress else None)
 
 
 def parse(arguments: Sequence[str]) -> Render:
@@ -137,6 +148,9 @@ def run(options: Render, report: Reporter) -> None:
         raise OptionError("--reuse-pixel goes with --reuse-pictures; give that too")
     resolution = parse_resolution(options.resolution) if options.resolution else None
     frame_time = parse_seconds(options.frame_time) if options.frame_time else None
+    chunk = chunk_of(options.chunk, options.warm_up, frame_time)
+    if options.cluster and (chunk or frame_time or options.reuse_pictures):
+        raise OptionError("--cluster goes without --chunk, --frame-time and --reuse-pictures; leave them out")
     output = find_output(options)
     check_targets(options)
     bakes = [load_bake(path) for path in options.bake]
@@ -152,18 +166,18 @@ def run(options: Render, report: Reporter) -> None:
     shots = find_shots(options, camera)
     if isinstance(scene, Scene):
         move_sky(scene, options.environment_turn, camera, [shot.index for shot in shots])
-    source = scene.bake if isinstance(scene, BakedScene) else scene
+    shown = scene.bake if isinstance(scene, BakedScene) else scene
     cache = BakeFolder() if options.cache else None
     scheduler = FrameScheduler(
-        source, camera, options.settings, options.device, options.seed, report.stage, bakes, cache
+        shown, camera, options.settings, options.device, options.seed, report.stage, bakes, cache
     )
     if options.reuse_pictures is not None:
         from warp_gi.techniques.reuse.pictures import check_pictures  # its kernels are not for every run
 
         check_pictures(scheduler, shots[-1].camera, options.reuse_pixel)
-    sequence = SequenceRun(scheduler, shots, output)
     with report.phase("bake"):
-        sequence.bake()
+        scheduler.bake(shots[0].time, len(shots))
+        sequence = run_of(scheduler, shots, output, chunk)
     if frame_time is not None:
         with report.phase("timing of frames"):
             samples = take_time(sequence, frame_time, options.resume)
@@ -176,14 +190,26 @@ def run(options: Render, report: Reporter) -> None:
     sequence.prepare(plan)
     started = time.perf_counter()
     try:
-        times = render_shots(options, plan, sequence, report)
+        times: dict[str, list[float]] = {}
+        if options.cluster:
+            if plan.todo:
+                from warp_gi.cli.cluster import render_on_cluster, scene_by_path
+
+                source = scene_by_path(options, options.environment_turn, sequence)
+                of_run = cache, options.resume, plan, sequence, report
+                render_on_cluster(options.cluster, source, options.bake, *of_run)
+        else:
+            sequence.lead()
+            times = render_shots(options, plan, sequence, report)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("finished frames are kept, --resume renders the others") from None
     finally:
         sequence.finish()
+    if chunk is not None and not plan.shots:
+        report.line(f"chunk {options.chunk} has no frame: there are {len(shots)} in all")
     count = f"{len(plan.todo)} frame{'s' * (len(plan.todo) != 1)}"
     report.line(f"{count} in {time.perf_counter() - started:.1f} s: {options.output}")
-    if options.verbose and plan.todo:
+    if options.verbose and times:
         times["bake"] = times["bake"][:1]  # every frame names the one bake
         rows = [(stage, *(f"{x:.3f}" for x in (v[0], sum(v) / len(v), max(v), sum(v)))) for stage, v in times.items()]
         report.table("seconds by stage", ("stage", "first frame", "mean", "largest", "sum"), rows)
@@ -256,5 +282,5 @@ def render_shot(shot: Shot, sequence: SequenceRun, report: Reporter) -> tuple[Fr
     compiled = launch.compile_seconds - compiled
     seconds = time.perf_counter() - started - compiled
     note = f" and {compiled:.1f} s compiling kernels" if compiled > 0.5 else ""
-    report.frame(f"{shot.path} {seconds:.2f} s{note}", seconds)
+    report.frame(f"{shot.path} {seconds:.2f} s{note}", seconds, shot.index, shot.path)
     return frame, frame.timings

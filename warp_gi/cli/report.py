@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar
 
 import warp as wp
@@ -17,6 +18,8 @@ import warp as wp
 from warp_gi import launch
 
 LINE_SECONDS = 10.0
+RECENT = 8
+"""Number of last frames by which the pace is told."""
 LOG_WIDTH, LONGEST_WORD, GAP = 200, 24, 3
 """Characters in a table's line where no terminal limits it, in the longest unbroken word, and between columns."""
 _M_MMAP_THRESHOLD = -3
@@ -38,6 +41,8 @@ class Reporter:
         self._task: Any = None
         self._total = self._done = 0
         self._seconds: list[float] = []
+        self.at_once = 1
+        """Number of frames that are rendered side by side."""
         self._begin_frame()
         log = logging.getLogger("warp_gi")
         log.handlers[:] = [_Lines(self)]
@@ -104,11 +109,12 @@ class Reporter:
             MofNCompleteColumn(),
             TextColumn("frames"),
             TimeElapsedColumn(),
+            TextColumn("{task.fields[pace]}"),
             TextColumn("{task.fields[left]}"),
             TextColumn("{task.description}", style="dim"),
         )
         with Progress(*columns) as self._bar:
-            self._task = self._bar.add_task("", total=total, left="")
+            self._task = self._bar.add_task("", total=total, left="", pace="")
             launch.on_load = lambda module: self.stage(f"compile {module}", 0.0)
             try:
                 yield
@@ -130,17 +136,27 @@ class Reporter:
                 left="" if left is None else f"{_clock(left)} left",
             )
 
-    def frame(self, text: str, seconds: float) -> None:
-        """Report a finished frame that took ``seconds``, compilation apart."""
+    def frame(self, text: str, seconds: float, index: int | None = None, path: Path | None = None, **more: str) -> None:
+        """Report a finished frame that took ``seconds``, compilation apart: its number, file and what else is known."""
+        self._count(seconds)
+        left, rate = self.time_left(), self.frames_per_minute
+        pace = f"{rate:.3g} frames a minute" if rate else ""
+        if self._bar is not None:
+            self._bar.update(self._task, completed=self._done, left=f"{_clock(left or 0)} left", pace=pace)
+        else:
+            rest = f", {pace}, {_clock(left)} left" if left else ""
+            self.line(f"[{self._done}/{self._total}] {text}{rest}")
+
+    def _count(self, seconds: float) -> None:
         self._done += 1
         self._seconds.append(seconds)
         self._begin_frame()
-        left = self.time_left()
-        if self._bar is not None:
-            self._bar.update(self._task, completed=self._done, left=f"{_clock(left or 0)} left")
-        else:
-            rest = f", {_clock(left)} left" if left else ""
-            self.line(f"[{self._done}/{self._total}] {text}{rest}")
+
+    @property
+    def frames_per_minute(self) -> float | None:
+        """Frames a minute, by the mean of the last frames, compilation apart; None before there is one."""
+        recent = sum(self._seconds[-RECENT:])
+        return 60.0 * self.at_once * len(self._seconds[-RECENT:]) / recent if recent else None
 
     def time_left(self, share: float = 0.0) -> float | None:
         """Return an estimate of the seconds left, or None before there is one.
@@ -149,8 +165,8 @@ class Reporter:
         """
         inside = time.perf_counter() - self._frame_started - (launch.compile_seconds - self._compiled)
         if self._seconds:
-            recent = self._seconds[-8:]
-            return max(sum(recent) / len(recent) * (self._total - self._done) - inside, 0.0)
+            recent = self._seconds[-RECENT:]
+            return max(sum(recent) / len(recent) * (self._total - self._done) / self.at_once - inside, 0.0)
         return inside / share * (self._total - share) if share else None
 
     def _begin_frame(self) -> None:
@@ -246,10 +262,12 @@ class RunOptions(Protocol):
 Options = TypeVar("Options", bound=RunOptions)
 
 
-def run_command(options: Options, run: Callable[[Options, Reporter], None]) -> int:
+def run_command(
+    options: Options, run: Callable[[Options, Reporter], None], reporter: type[Reporter] | None = None
+) -> int:
     """Start Warp as the options of a command say, run it, and return its exit code."""
     start_warp(options.device, options.threads)
-    run(options, Reporter(options.quiet))
+    run(options, (reporter or Reporter)(options.quiet))
     return 0
 
 

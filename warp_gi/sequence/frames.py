@@ -26,6 +26,7 @@ from warp_gi.sequence.preview import picture_bytes, tone_map, write_png
 MOST_FRAMES = 1_000_000
 PREFIX = "warp_gi/"
 TIMES = "warp_gi/seconds/"
+MEASURED = "warp_gi/measured/"
 
 
 class FrameLike(Protocol):
@@ -199,6 +200,7 @@ def write_frame(frame: FrameLike, pattern: str | Path, precision: str = "half") 
     previous = getattr(frame, "previous_camera", None)
     attributes = frame_attributes(frame.index, frame.time, frame.camera, frame.metadata, previous, precision)
     attributes |= {TIMES + stage: float(seconds) for stage, seconds in frame.timings.items()}
+    attributes |= {MEASURED + name: float(value) for name, value in getattr(frame, "measured", {}).items()}
     buffers = {name: frame.numpy(name) for name in frame.names}
     with replacing(path) as part:
         try:
@@ -226,7 +228,8 @@ def read_frame(path: str | Path) -> FrameFile:
     """Read a frame's buffers and metadata back; raises SceneError when the file is missing or not whole."""
     buffers, attributes, formats = read_exr(user_path(path))
     numbers = {name: value for name, value in attributes.items() if not isinstance(value, np.ndarray)}
-    metadata = {k[len(PREFIX) :]: v for k, v in numbers.items() if k.startswith(PREFIX) and not k.startswith(TIMES)}
+    apart = TIMES, MEASURED
+    metadata = {k[len(PREFIX) :]: v for k, v in numbers.items() if k.startswith(PREFIX) and not k.startswith(apart)}
     timings = {k[len(TIMES) :]: float(v) for k, v in numbers.items() if k.startswith(TIMES)}
     camera, world_to_camera = None, attributes.get("worldToCamera")
     if isinstance(world_to_camera, np.ndarray) and "hfov" in attributes:

@@ -10,6 +10,7 @@ Lines about what is kept, and why it is not, are logged (logger "warp_gi", level
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import hashlib
 import logging
@@ -20,7 +21,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from warp_gi.baking import load_bake
+from warp_gi.baking import settings_in
 from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.files import check_target, check_writable, frame_path, remove_stale_parts, user_path
 from warp_gi.scene.camera import Camera, CameraPath, frame_time
@@ -60,6 +61,8 @@ class Output:
     """Whether a tone-mapped PNG is written beside each EXR file."""
     exposure: float = 0.0
     """Exposure of PNG files in stops."""
+    part: str = ""
+    """Name of the part of a sequence that is rendered, which has a state file of its own; "" is the whole sequence."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "pattern", user_path(self.pattern))
@@ -77,8 +80,13 @@ class Output:
     @property
     def state_path(self) -> Path:
         """File beside the frames that keeps what the sequence knows after its last frame."""
-        stem = self.pattern.stem.replace("#", "").strip("._-") or "frames"
-        return self.pattern.with_name(f"{stem}.state.safetensors")
+        part = f".{self.part}" if self.part else ""
+        return self.pattern.with_name(f"{self.stem}{part}.state.safetensors")
+
+    @property
+    def stem(self) -> str:
+        """Name of the frames' files without their numbers."""
+        return self.pattern.stem.replace("#", "").strip("._-") or "frames"
 
     def write(self, frame: Frame, path: Path) -> None:
         """Write the preview, then the frame: a whole frame has its preview. Raises OSError."""
@@ -183,6 +191,8 @@ class SequenceRun:
     def __init__(self, scheduler: FrameScheduler, shots: Sequence[Shot], output: Output) -> None:
         self.scheduler, self.shots, self.output = scheduler, tuple(shots), output
         self._claim: Claim | None = None
+        self.since = 0
+        """Time in ns, by the clock of the disk, from which on files are kept by a resumed run; 0 is any time."""
 
     def bake(self) -> None:
         """Bake under the sky of the sequence's first frame, so that a resumed sequence has the same bake."""
@@ -200,30 +210,44 @@ class SequenceRun:
 
         Without ``resume`` that is every frame. Raises OptionError for files that do not say how they were made.
         """
-        if resume and not self.output.is_exr:
-            raise OptionError("resume needs .exr files, which say how they were made; a .png does not")
-        dependence, shots, problems, lineage = self.dependence, [], {}, ""
-        for shot in self.shots:
-            if dependence.on_past:
-                lineage = self._lineage(shot, lineage)
-                shot = replace(shot, lineage=lineage)
-            shots.append(shot)
-            problem = why_not_whole(shot.path, self._attributes(shot), shot.camera) if resume else None
-            if problem is not None:
-                problems[shot.index] = problem
+        self._check_resumable(resume)
+        dependence, shots = self.dependence, self.with_lineages(self.shots)
+        problems = self._problems(shots, resume)
         if not resume:
             return Plan(tuple(shots), tuple(shots), dependence=dependence)
-        for shot in shots:
-            if problems.get(shot.index, MISSING) != MISSING:
-                _LOG.info("%s is rendered again: %s", shot.path, problems[shot.index])
         todo, restart = [shot for shot in shots if shot.index in problems], ""
         if todo and len(todo) < len(shots) and dependence.on_past:
             gap = next(place for place, shot in enumerate(shots) if shot.index in problems)
             todo = shots[self._load_state(shots[:gap]) :]
             if len(todo) == len(shots):
-                restart = _why_restart(dependence)
+                restart = why_restart(dependence)
                 _LOG.info("every frame is rendered again: %s", restart)
         return Plan(tuple(shots), tuple(todo), problems, restart, dependence)
+
+    def _check_resumable(self, resume: bool) -> None:
+        if resume and not self.output.is_exr:
+            raise OptionError("resume needs .exr files, which say how they were made; a .png does not")
+
+    def with_lineages(self, shots: Sequence[Shot]) -> list[Shot]:
+        """Return frames that follow each other with their lineages, where they depend on those before."""
+        found, lineage = [], ""
+        for shot in shots:
+            if self.dependence.on_past:
+                lineage = self._lineage(shot, lineage)
+                shot = replace(shot, lineage=lineage)
+            found.append(shot)
+        return found
+
+    def _problems(self, shots: Sequence[Shot], resume: bool) -> dict[int, str]:
+        """Return why files cannot be kept, by frame number; nothing without ``resume``, which keeps none."""
+        if not resume:
+            return {}
+        found = {shot.index: self.problem(shot) for shot in shots}
+        problems = {index: problem for index, problem in found.items() if problem is not None}
+        for shot in shots:
+            if problems.get(shot.index, MISSING) != MISSING:
+                _LOG.info("%s is rendered again: %s", shot.path, problems[shot.index])
+        return problems
 
     def prepare(self, plan: Plan) -> None:
         """Write previews that kept frames lack, make the folder, and remove what a killed run left there.
@@ -237,13 +261,17 @@ class SequenceRun:
                 write_preview(read_frame(shot.path), preview, self.output.exposure)
         if plan.todo:
             check_writable(self.output.pattern.parent)
-            self._claim = Claim(self.output.pattern, plan.frames, plan.dependence.is_saved and self.output.is_exr)
+            has_state = plan.dependence.is_saved and self.output.is_exr and not self.output.part
+            self._claim = Claim(self.output.pattern, plan.frames, has_state)
             self._claim.take()
             remove_stale_parts(self.output.state_path)
         for shot in plan.todo:
             check_target(shot.path)
         if plan.done:
             _LOG.info("%d of %d frames are there already", len(plan.done), len(plan.shots))
+
+    def lead(self) -> None:
+        """Render what the first frame of the plan needs and is not in it: nothing, but in a part of a sequence."""
 
     def finish(self) -> None:
         """Let other processes write the files again."""
@@ -258,18 +286,27 @@ class SequenceRun:
 
     def is_done(self, shot: Shot) -> bool:
         """Return whether the file of a frame is whole, and as this run would write it."""
-        return why_not_whole(shot.path, self._attributes(shot), shot.camera) is None
+        return self.problem(shot) is None
+
+    def problem(self, shot: Shot) -> str | None:
+        """Return why the file of a frame cannot be kept, in a few words; None if it can."""
+        found = why_not_whole(shot.path, self._attributes(shot), shot.camera)
+        if found is None and shot.path.stat().st_mtime_ns < self.since:
+            return "of an earlier run"
+        return found
 
     def render(self, shot: Shot) -> Frame:
         """Render a frame of the plan's ``todo`` and write its file; the time it took is the frame's timing "write"."""
-        frame = self.scheduler.frame(shot.index, shot.previous)
-        if shot.lineage:
-            frame.metadata["lineage"] = shot.lineage
+        frame = self._rendered(shot)
+        frame.metadata |= self._origin(shot)
         started = time.perf_counter()
         remove_stale_parts(shot.path)
         self.output.write(frame, shot.path)
         frame.timings["write"] = time.perf_counter() - started
         return frame
+
+    def _rendered(self, shot: Shot) -> Frame:
+        return self.scheduler.frame(shot.index, shot.previous)
 
     def save_state(self, shot: Shot, frame: Frame) -> None:
         """Save the state after a frame, if later frames depend on it and a file can hold it all.
@@ -285,11 +322,14 @@ class SequenceRun:
         """Return what a frame's file has to say, under the sky of that frame."""
         with self.scheduler.scene.lock:
             metadata = self.scheduler.metadata(shot.time)
-        if shot.lineage:
-            metadata = metadata | {"lineage": shot.lineage}
+        metadata |= self._origin(shot)
         return frame_attributes(
             shot.index, shot.time, shot.camera, metadata, shot.previous_camera, self.output.precision
         )
+
+    def _origin(self, shot: Shot) -> dict[str, str | int | float]:
+        """Return metadata that say on which frames a frame depends."""
+        return {"lineage": shot.lineage} if shot.lineage else {}
 
     def _lineage(self, shot: Shot, before: str) -> str:
         """Return a hash of all that decides a frame and those before it, whose hash is ``before``."""
@@ -298,22 +338,26 @@ class SequenceRun:
 
     def _load_state(self, whole: Sequence[Shot]) -> int:
         """Let the scheduler go on from a saved state; return the number of frames that need not be rendered again."""
-        path = self.output.state_path
-        if not (self.dependence.is_saved and whole and path.exists()):
-            return 0
-        lineages = [shot.lineage for shot in whole]
-        try:
-            known = load_bake(path).settings.get("lineage")
-            if known not in lineages:
-                return 0
-            self.scheduler.bake(whole[lineages.index(known)].time)  # the state is of a frame under that sky
-            self.scheduler.load_state(path, known)
-        except BakeError:  # damaged, or of other settings
-            return 0
-        return lineages.index(known) + 1
+        places = {shot.lineage: place for place, shot in enumerate(whole)}
+        found: list[tuple[int, Path]] = []
+        for path in self._state_paths() if self.dependence.is_saved and whole else ():
+            with contextlib.suppress(BakeError):  # damaged, or another program's
+                lineage = settings_in(path).get("lineage")
+                if lineage in places:
+                    found.append((places[str(lineage)], path))
+        for place, path in sorted(found, reverse=True):
+            with contextlib.suppress(BakeError):  # damaged, or of other settings
+                self.scheduler.bake(whole[place].time)  # the state is of a frame under that sky
+                self.scheduler.load_state(path, whole[place].lineage)
+                return place + 1
+        return 0
+
+    def _state_paths(self) -> list[Path]:
+        """Return the state files from which the sequence may go on."""
+        return [self.output.state_path] if self.output.state_path.exists() else []
 
 
-def _why_restart(dependence: Dependence) -> str:
+def why_restart(dependence: Dependence) -> str:
     """Return why every frame is rendered again where some are there already."""
     words = {"denoiser": "the denoiser"}
     places = [name.partition(".")[0] for name in dependence.unsaved or dependence.on_past]
