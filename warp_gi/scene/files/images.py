@@ -5,11 +5,24 @@ from __future__ import annotations
 import difflib
 import io
 import os
+import struct
+import warnings
+import zlib
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from warp_gi.color import bands
 from warp_gi.errors import SceneError, one_line
+from warp_gi.memory import check_memory
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+MOST_TEXELS = 1 << 27
+"""Largest number of pixels of a texture's file: 16384 x 8192."""
+_LIMIT = f"at most {MOST_TEXELS:,} are supported (16384x8192); scale it down"
 
 
 def missing_file(path: Path, what: str) -> SceneError:
@@ -40,19 +53,51 @@ def find_file(folder: Path, name: str, what: str) -> Path:
 def read_image(source: Path | bytes | memoryview, what: str) -> np.ndarray:
     """Return the pixels of an image file or of its bytes, uint8 [height, width, 4], row 0 at the top.
 
-    16-bit images lose their low byte. Raises SceneError naming ``what`` if it is damaged, cut short or empty.
+    16-bit images lose their low byte. Raises SceneError naming ``what`` if it is damaged, cut short or empty, and
+    before its pixels are read if it has more than ``MOST_TEXELS`` or does not fit into memory.
     """
     from PIL import Image
 
     try:
-        with Image.open(source if isinstance(source, Path) else io.BytesIO(source)) as image:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit here is another one
+            opened = Image.open(source if isinstance(source, Path) else io.BytesIO(source))
+        with opened as image:
+            width, height = image.size
+            if 0 in image.size:
+                raise SceneError(f"{what} has no pixels ({width}x{height}); replace it")
+            if width * height > MOST_TEXELS:
+                raise SceneError(f"{what} has {width}x{height} pixels, {_LIMIT}")
+            check_memory(f"{what}: {width}x{height} pixels", 9 * width * height)
             if image.mode.startswith("I"):
                 grey = (np.asarray(image, np.int64) >> 8).clip(0, 255).astype(np.uint8)
                 return np.stack([grey, grey, grey, np.full_like(grey, 255)], axis=-1)
-            pixels = np.array(image.convert("RGBA"))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        reason = one_line(error)
+            return _rgba(image)
+    except Image.DecompressionBombError as error:
+        raise SceneError(f"{what} is too large: {_LIMIT}") from error
+    except SceneError:
+        raise
+    except (
+        OSError,
+        ValueError,
+        SyntaxError,
+        ArithmeticError,
+        LookupError,
+        TypeError,
+        struct.error,
+        zlib.error,
+    ) as error:
+        reason = one_line(error, type(error).__name__)  # readers of damaged files raise what they stumble over
         raise SceneError(f"{what} cannot be read as an image ({reason}); replace or repair it") from error
-    if pixels.size == 0:
-        raise SceneError(f"{what} has no pixels ({pixels.shape[1]}x{pixels.shape[0]}); replace it")
+
+
+def _rgba(image: Image.Image) -> np.ndarray:
+    """Return the pixels of an image, uint8 [height, width, 4]; converted some rows at a time to save memory."""
+    width, height = image.size
+    if image.mode not in ("RGB", "RGBA", "L") or "transparency" in image.info:
+        return np.array(image.convert("RGBA"))
+    image.load()
+    pixels = np.empty((height, width, 4), np.uint8)
+    for rows in bands(height, width):
+        pixels[rows] = np.asarray(image.crop((0, rows.start, width, rows.stop)).convert("RGBA"))
     return pixels
