@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import contextvars
 import difflib
 import io
 import os
 import struct
 import warnings
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,6 +28,36 @@ MOST_TEXELS = 1 << 27
 _LIMIT = f"at most {MOST_TEXELS:,} are supported (16384x8192); scale it down"
 
 
+class OutsideError(SceneError):
+    """A scene names a file outside of its own folder, and may not."""
+
+
+_root: contextvars.ContextVar[str | None] = contextvars.ContextVar("root", default=None)
+
+
+@contextlib.contextmanager
+def restricted_to(folder: Path | None) -> Iterator[None]:
+    """Let scenes that are read in the block name files in a folder alone; None lets them name any."""
+    token = _root.set(None if folder is None else os.path.realpath(folder))
+    try:
+        yield
+    finally:
+        _root.reset(token)
+
+
+def check_inside(path: Path, what: str) -> None:
+    """Raise OutsideError for a file that a scene may not name: links and ".." are followed, nothing is opened."""
+    root = _root.get()
+    if root is None:
+        return
+    real = os.path.realpath(path)
+    if os.path.commonpath([root, real]) != root:
+        raise OutsideError(
+            f"{what} lies outside of the scene's folder {root!r}, and paths are restricted to it; copy the file there,"
+            " or allow the path"
+        )
+
+
 def missing_file(path: Path, what: str) -> SceneError:
     """Return an error that says ``what`` is a folder, or is missing, and names the nearest file in the folder."""
     if os.path.isdir(path):
@@ -37,14 +70,19 @@ def missing_file(path: Path, what: str) -> SceneError:
 
 
 def find_file(folder: Path, name: str, what: str) -> Path:
-    """Return the path of file ``name`` under ``folder``, upper and lower case aside; raises SceneError if missing."""
+    """Return the path of file ``name`` under ``folder``, upper and lower case aside; raises SceneError if missing.
+
+    It is an OutsideError where ``restricted_to`` forbids the file.
+    """
     path = folder / name.replace("\\", "/")
+    check_inside(path, f"{what} {name!r}" if name not in what else what)
     if os.path.isfile(path):  # False, not an error, for names that are too long
         return path
     found = folder
     for part in Path(name.replace("\\", "/")).parts:
         alike = [p for p in found.iterdir() if p.name.lower() == part.lower()] if os.path.isdir(found) else []
         found = found / (part if part == ".." or not alike else alike[0].name)
+    check_inside(found, f"{what} {name!r}" if name not in what else what)
     if os.path.isfile(found):
         return found
     raise missing_file(path, what)
