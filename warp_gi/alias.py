@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,10 +35,11 @@ class AliasTable:
         return on_device(self.buckets(), types.AliasBucket, device)
 
     @staticmethod
-    def build(weights: np.ndarray) -> AliasTable:
+    def build(weights: np.ndarray, overwrite: bool = False) -> AliasTable:
         """Return the table that selects item k with probability ``weights[k] / sum(weights)``.
 
-        ``weights`` is [n], finite and not negative; if all are zero, items are equally likely.
+        ``weights`` is [n], finite and not negative; if all are zero, items are equally likely. With ``overwrite`` a
+        float64 array of them may be written to, which takes less memory: of n items 40 n bytes at most.
         Raises ValueError for an empty table or other weights.
 
         Buckets below the mean ("small") are filled up, in order, from those above it ("large"), in order;
@@ -51,23 +53,44 @@ class AliasTable:
         n = weights.size
         if total == 0:
             weights, total = np.ones(n), float(n)
-        scaled = weights * (n / total)
-        keep = np.ones(n)
+        scaled = np.multiply(weights, n / total, out=weights if overwrite else None)
+        del weights
+        keep = np.ones(n, np.float32)
         index = np.arange(n, dtype=np.int32)
-        small = np.flatnonzero(scaled < 1)
-        large = np.flatnonzero(scaled >= 1)
+        is_small = scaled < 1
+        small, large = index[is_small], index[~is_small]
         if len(small) and len(large):
-            lacking = np.cumsum(1 - scaled[small])
-            spare = np.cumsum(scaled[large] - 1)
-            before = np.concatenate([[0.0], lacking[:-1]])
-            giver = np.searchsorted(spare, before, side="right")
-            keep[small] = scaled[small]
-            index[small] = large[np.minimum(giver, len(large) - 1)]
+            taken_before = np.zeros(len(small) + 1)  # by all small ones before; the last is what all of them lack
+            spare = np.zeros(len(large))
+            for some in _parts(len(small)):
+                keep[small[some]] = scaled[small[some]]
+                lacking = 1 - scaled[small[some]]
+                lacking[0] += taken_before[some.start]
+                np.cumsum(lacking, out=taken_before[some.start + 1 : some.stop + 1])
+            for some in _parts(len(large)):
+                spare[some] = scaled[large[some]] - 1
+                spare[some.start] += spare[some.start - 1] if some.start else 0
+                np.cumsum(spare[some], out=spare[some])
+            del scaled
+            before, last = taken_before[:-1], len(large) - 1
+            for some in _parts(len(small)):
+                index[small[some]] = large[np.minimum(np.searchsorted(spare, before[some], side="right"), last)]
             # A large bucket that gave more than it had to spare is itself filled by the next large one.
-            taken = lacking[np.maximum(np.searchsorted(before, spare, side="left") - 1, 0)]
-            keep[large[:-1]] = np.clip(1 + spare[:-1] - taken[:-1], 0, 1)
+            for some in _parts(last):
+                taken = taken_before[np.maximum(np.searchsorted(before, spare[some], side="left"), 1)]
+                keep[large[some]] = np.clip(1 + spare[some] - taken, 0, 1)
             index[large[:-1]] = large[1:]
-        keep = keep.astype(np.float32)
-        share = keep.astype(np.float64)
-        pdf = (share + np.bincount(index, 1 - share, minlength=n)) / n
-        return AliasTable(keep, index, pdf.astype(np.float32))
+            del taken_before, before, spare
+        del small, large, is_small
+        share = np.zeros(n)
+        for some in _parts(n):  # in the order of the buckets, as one pass would add them
+            np.add.at(share, index[some], 1 - keep[some].astype(np.float64))
+        share += keep
+        share /= n
+        return AliasTable(keep, index, share.astype(np.float32))
+
+
+def _parts(count: int) -> Iterator[slice]:
+    """Yield slices of ``count`` items, in order, of at most 2^20 each."""
+    for start in range(0, count, 1 << 20):
+        yield slice(start, min(start + (1 << 20), count))

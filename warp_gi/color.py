@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -15,6 +15,25 @@ RGB_FROM_XYZ = np.array(
 """Linear Rec. 709 of CIE XYZ; white is D65. float64 [3, 3]."""
 BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 """Cone responses of XYZ, in which white is adapted (Lam 1985; the ICC's choice). float64 [3, 3]."""
+
+
+BAND = 1 << 20
+"""Values of an image that are computed with at once in float64: a whole one would take many times its memory."""
+
+
+def bands(height: int, width: int) -> Iterator[slice]:
+    """Yield slices of the rows of an image, in order, of at most ``BAND`` pixels each or one row."""
+    rows = max(BAND // max(width, 1), 1)
+    for row in range(0, height, rows):
+        yield slice(row, min(row + rows, height))
+
+
+def luminance_of(pixels: np.ndarray) -> np.ndarray:
+    """Return the luminance of linear Rec. 709 pixels [height, width, 3], float64 [height, width]."""
+    result = np.empty(pixels.shape[:2])
+    for rows in bands(*pixels.shape[:2]):
+        np.matmul(pixels[rows], LUMINANCE, out=result[rows])
+    return result
 
 
 def rgb_from_primaries(chromaticities: Sequence[float]) -> np.ndarray | None:

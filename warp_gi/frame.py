@@ -247,6 +247,8 @@ class Frame:
 
     def keep_noisy(self) -> None:
         """Make the composed beauty the buffer "noisy", and an empty beauty for a denoiser to fill."""
+        self._forget_moments()
+        self.hits = gbuffer.PrimaryHits()  # 28 bytes a pixel, which light was gathered for
         self._arrays["noisy"] = self._arrays["beauty"]
         self._arrays["beauty"] = wp.empty_like(self._arrays["noisy"])
 
@@ -264,6 +266,12 @@ class Frame:
         """Forget what was handed over: the frame is done, and whoever keeps it wants its buffers."""
         self._offers.clear()
         self.paths.finish()
+        self._forget_moments()
+
+    def _forget_moments(self) -> None:
+        """Let go of sums of samples and of their squares, 24 bytes a pixel: the variance is made of them already."""
+        for name in [name for name in self._arrays if "moment" in name]:
+            del self._arrays[name]
 
     # ---- camera samples ----
 

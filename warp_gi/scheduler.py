@@ -23,6 +23,7 @@ from warp_gi.forecast import tell_cost
 from warp_gi.frame import Frame, mixed_seed, timed
 from warp_gi.kept import BakeFolder, cached_bake
 from warp_gi.kernels import compose, types
+from warp_gi.memory import check_picture
 from warp_gi.pipeline import DENOISER, Pipeline
 from warp_gi.primary import CameraRays
 from warp_gi.radiance_cache import RadianceCache
@@ -100,6 +101,7 @@ class FrameScheduler:
         if isinstance(self.scene, Scene):
             warn_if_far(self.camera, self.scene)
         self.device = launch.get_device(device)
+        check_picture(self.camera.resolution, self.pipeline.denoise is not None, self.device)
         self._progress = progress or (lambda stage, share: None)
         self._parts = self.pipeline.parts()
         self._bakes = _bakes_by_class(bakes, self._parts)
@@ -111,8 +113,7 @@ class FrameScheduler:
         if self.pipeline.denoise is not None:  # first of all: it says if it is not installed
             self._start_part(DENOISER, self.pipeline.denoise)
         self._frames: int | None = None
-        self._bake_seconds = 0.0
-        self._baked_version = -1
+        self._bake_seconds, self._baked_version = 0.0, -1
         self._sky_time = sky_start(self.scene.sky_at)
         self._scene_hash = ""
         self._frame_time: float | None = None

@@ -13,8 +13,9 @@ import tyro
 from warp_gi import metrics
 from warp_gi.cli.options import parse_options
 from warp_gi.cli.report import print_table
-from warp_gi.errors import OptionError, SceneError
+from warp_gi.errors import OptionError, SceneError, one_line
 from warp_gi.files import replacing
+from warp_gi.scene.files import images
 from warp_gi.sequence.exr import read_exr, write_exr
 from warp_gi.sequence.preview import magma, tone_map, write_png
 
@@ -81,23 +82,20 @@ def read_image(path: Path, layer: str = "beauty") -> np.ndarray:
         return buffers[layer]
     if kind == ".npy":
         try:
-            return np.load(path, allow_pickle=False)
-        except ValueError as error:
-            raise SceneError(f"{path}: not a NumPy array ({error})") from error
+            array = np.load(path, allow_pickle=False)
+        except (ValueError, OSError, EOFError, SyntaxError, TypeError) as error:
+            raise SceneError(f"{path}: not a NumPy array ({one_line(error)})") from error
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fuib" or array.ndim not in (2, 3):
+            raise SceneError(
+                f"{path}: expected numbers [height, width] or [height, width, channels], got {array!r:.80}"
+            )
+        return array
     if kind == ".hdr":
-        import OpenImageIO as oiio
-
-        pixels = oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT)
-        if pixels is None:
-            raise SceneError(f"{path}: not a readable HDR file")
-        return pixels
-    from PIL import Image, UnidentifiedImageError
-
+        return next(iter(read_exr(path)[0].values()))
     try:
-        with Image.open(path) as picture:
-            return np.asarray(picture.convert("RGB"))
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
-        raise SceneError(f"{path}: not a picture that can be read; give EXR, HDR, NPY, PNG or JPEG") from error
+        return np.ascontiguousarray(images.read_image(path, str(path))[..., :3])
+    except SceneError as error:
+        raise SceneError(f"{error}; expected EXR, HDR, NPY, PNG or JPEG") from error
 
 
 def write_difference(

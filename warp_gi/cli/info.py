@@ -23,13 +23,15 @@ class Info:
 
     scene: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """A GLB, glTF, OBJ or PLY file, or the name of a built-in scene."""
+    restrict_paths: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Let the scene's file name files in its own folder or below alone, for scenes of strangers."""
 
 
 def main(arguments: Sequence[str]) -> int:
     """Run the command."""
     options = parse_options(Info, "info", arguments)
     start_warp()
-    scene = open_scene(options.scene)
+    scene = open_scene(options.scene, restrict_paths=options.restrict_paths)
     print_table(options.scene, ("what", "value"), summary(scene))
     print_table(
         "materials",

@@ -44,6 +44,8 @@ class SceneOptions:
     recentre: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Take the middle of the scene from all positions, in double precision. That is done without being asked where
     float32 has steps of more than a millimetre. Cameras stay in the file's coordinates; frames say what was taken."""
+    restrict_paths: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Let the scene's file name files in its own folder or below alone, for scenes of strangers."""
     environment: Annotated[str, flag("SKY", "the scene's own; files: none")] = ""
     """Sky of the scene: a latitude-longitude EXR or HDR file, a radiance R,G,B, sun-sky, or none. FILE:layer
     chooses a part or layer of an EXR file. In sky.####.exr the frame's number takes the place of ####, so that each
@@ -74,6 +76,7 @@ def open_scene(
     scale: float = 1.0,
     recentre: bool | None = None,
     up: Literal["x", "y", "z"] = "y",
+    restrict_paths: bool = False,
 ) -> Scene:
     """Return a built-in scene by name, or one from a file (the other arguments are those of ``load_scene``)."""
     if name in BUILTIN_SCENES and not Path(name).is_file():
@@ -82,13 +85,14 @@ def open_scene(
         return builtin_scene(name)
     if not Path(name).suffix and not Path(name).exists():
         raise unknown_name("scene", name, BUILTIN_SCENES)
-    return load_scene(name, smooth=smooth, scale=scale, recentre=recentre, up=up)
+    return load_scene(name, smooth=smooth, scale=scale, recentre=recentre, up=up, restrict_paths=restrict_paths)
 
 
 def find_scene(options: SceneOptions) -> Scene:
     """Return the scene that was asked for, with its sky."""
     name = options.scene or DEFAULT_SCENE
-    scene = open_scene(name, options.smooth, options.scale, options.recentre or None, options.up)
+    of_file = options.smooth, options.scale, options.recentre or None, options.up, options.restrict_paths
+    scene = open_scene(name, *of_file)
     if options.sun != SunSky() and options.environment != "sun-sky":
         raise OptionError("--sun.elevation and other --sun flags go with --environment sun-sky; give that too")
     if options.environment:

@@ -39,7 +39,7 @@ class History:
     scene: tuple[Scene | BakedScene, str]
     """Scene and the hash of what must not have changed: ``light_of``."""
     guides: denoise.Guides
-    """Geometry and colours of the surfaces in the frame's pixels."""
+    """Geometry of the surfaces in the frame's pixels: ``READ_GUIDES``."""
     average: denoise.Signals
     """Averages over frames of diffuse and glossy light, and the number of frames in them."""
     apart: ApartHistory | None = None
@@ -93,6 +93,14 @@ class History:
 
 READ_GUIDES = ("guide_object", "guide_normal", "guide_position", "guide_reflected")
 """Guides that the next frame reads (``denoise.same_surface``)."""
+
+
+def read_guides(guides: denoise.Guides) -> denoise.Guides:
+    """Return guides with nothing but what the next frame reads: 28 of 88 bytes a pixel."""
+    kept = _empty(denoise.Guides, guides.guide_object.device)
+    for name in READ_GUIDES:
+        setattr(kept, name, getattr(guides, name))
+    return kept
 
 
 def _read_next(guides: denoise.Guides, average: denoise.Signals) -> list[tuple[Any, str]]:

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from warp_gi.denoise.base import Denoiser
-from warp_gi.denoise.history import ApartHistory, History, light_of
+from warp_gi.denoise.history import ApartHistory, History, light_of, read_guides
 from warp_gi.errors import OptionError, check_whole
 from warp_gi.kernels import apart_lights, denoise, denoise_apart, denoise_edges, denoise_reflections
 from warp_gi.scene.apart import ApartLights, has_apart_lights
@@ -150,7 +150,7 @@ class SpatioTemporal(Denoiser):
         last = state.picture if has_history else None
         picture = self._finished(frame, settings, guides, filtered, changes, last)
         scene = (frame.scene, light_of(frame.scene))
-        return History(frame.index, frame.camera.resolution, scene, guides, average, apart, picture)
+        return History(frame.index, frame.camera.resolution, scene, read_guides(guides), average, apart, picture)
 
     def _accumulated(
         self,

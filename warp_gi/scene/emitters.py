@@ -13,7 +13,7 @@ from warp_gi.kernels import types
 from warp_gi.scene.geometry import FlatGeometry, placed_points, triangle_areas
 from warp_gi.scene.model import Material, Node, PunctualLight
 from warp_gi.scene.poses import poses
-from warp_gi.scene.textures import box_means, linear_rgb, texture_coordinates
+from warp_gi.scene.textures import box_means, linear_shades, texture_coordinates
 
 LIGHT_KINDS = {
     "point": types.EMITTER_POINT,
@@ -98,9 +98,8 @@ def emissive_triangles(flat: FlatGeometry, materials: Sequence[Material]) -> tup
             ids = flat.indices[triangles[mine]]
             further = None if flat.further_uvs is None else flat.further_uvs[ids]
             uvs = texture_coordinates(texture, flat.uvs[ids], further)
-            image, low, high = linear_rgb(texture), uvs.min(axis=1), uvs.max(axis=1)
-            means = [box_means(image[..., k : k + 1], texture.wrap, low, high) for k in range(3)]
-            radiance = radiance * np.concatenate(means, axis=1)
+            shades, low, high = linear_shades(texture), uvs.min(axis=1), uvs.max(axis=1)
+            radiance = radiance * box_means(texture.pixels[..., :3], texture.wrap, low, high, shades)
         if material.colors_emit and flat.colors is not None:
             radiance = radiance * flat.colors[flat.indices[triangles[mine]], :3].astype(np.float64).mean(axis=1)
         powers[mine] *= radiance @ LUMINANCE * (2.0 if material.double_sided else 1.0)

@@ -66,13 +66,13 @@ def project(pixels: np.ndarray, order: int = 3) -> np.ndarray:
         return rotate(_from_rings(ring_coefficients(pixels, order)), _POLAR_FROM_MAP.T)
     theta = np.arange(height) * math.pi / (height - 1)
     phi = (np.arange(width) + 0.5) * 2 * math.pi / width
-    weighted = pixels.astype(np.float64) * node_solid_angles(height, width)[:, None, None]
+    areas = node_solid_angles(height, width)
     result = np.zeros((3, 9))
     for row in range(height):  # a row at a time: a large map times nine functions would not fit the cache
         ring = np.full(width, math.sin(theta[row]))
         up = np.full(width, math.cos(theta[row]))
         directions = np.stack([ring * np.sin(phi), up, -ring * np.cos(phi)], axis=-1)
-        result += weighted[row].T @ basis(directions)
+        result += (pixels[row].astype(np.float64) * areas[row]).T @ basis(directions)
     return result
 
 

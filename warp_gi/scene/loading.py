@@ -14,7 +14,7 @@ from warp_gi.errors import OptionError, SceneError, one_line, unknown_name
 from warp_gi.files import user_path
 from warp_gi.scene.environment import Sky
 from warp_gi.scene.files.from_trimesh import is_trimesh, trimesh_parts
-from warp_gi.scene.files.images import missing_file
+from warp_gi.scene.files.images import missing_file, restricted_to
 from warp_gi.scene.files.parts import SceneParts
 from warp_gi.scene.geometry import triangulated
 from warp_gi.scene.model import Material, Mesh, Node
@@ -45,6 +45,7 @@ def load_scene(
     scale: float = 1.0,
     recentre: bool | None = None,
     up: Literal["x", "y", "z"] = "y",
+    restrict_paths: bool = False,
 ) -> Scene:
     """Load a scene from a GLB, glTF, OBJ (with MTL), PLY, STL or OFF file, or from an object of trimesh.
 
@@ -61,6 +62,8 @@ def load_scene(
             where float32 has steps of more than a millimetre.
         up: Axis of the file that points up, and becomes y. Where it is z, as in surveys and CAD, (x, y, z) of the file
             is (x, z, -y) of the scene. All else, cameras too, is then given in the turned coordinates.
+        restrict_paths: Whether buffers, textures and libraries that the file names may only lie in its folder or below,
+            links and ".." followed: for files of strangers. Others are an error before they are opened.
 
     Gives an UnsupportedWarning for each feature that the file uses and this library does not read in full.
     Raises SceneError if the file or anything it names is missing, damaged or unusable: one line.
@@ -75,7 +78,8 @@ def load_scene(
         if not str(path):
             raise SceneError("the name of the scene file is empty; give a GLB, glTF, OBJ or PLY file")
         path = user_path(path)
-        name, told, parts = path.stem, str(path), _file_parts(path)
+        with restricted_to(path.parent if restrict_paths else None):
+            name, told, parts = path.stem, str(path), _file_parts(path)
     elif is_trimesh(path):
         name, told, parts = "trimesh", "the trimesh object", trimesh_parts(path)
     else:

@@ -46,9 +46,10 @@ def alpha_masks(
         if texture is None:
             holed = triangles if material.alpha * thinnest < whole else triangles[:0]
         else:
-            cut = texture.pixels[..., 3:] * (material.alpha * thinnest / 255.0) < whole
+            cut = np.arange(256) * (material.alpha * thinnest / 255.0) < whole
             uvs = flat.uvs[flat.indices[triangles]]
-            holed = triangles[box_means(cut, texture.wrap, uvs.min(axis=1), uvs.max(axis=1))[:, 0] > 0.0]
+            boxes = uvs.min(axis=1), uvs.max(axis=1)
+            holed = triangles[box_means(texture.pixels[..., 3:], texture.wrap, *boxes, cut)[:, 0] > 0.0]
         if material.is_glass:
             holed = triangles
             tint = tints.get(index)

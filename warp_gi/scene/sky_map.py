@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from warp_gi.alias import AliasTable
-from warp_gi.color import LUMINANCE
+from warp_gi.color import LUMINANCE, luminance_of
 from warp_gi.kernels import apart_lights
 from warp_gi.launch import on_device
 from warp_gi.scene import harmonics
@@ -63,7 +63,9 @@ class SkyMap:
 
     @cached_property
     def digest(self) -> bytes:
-        return hashlib.sha256(np.array(self.pixels.shape, np.int64).tobytes() + self.pixels.tobytes()).digest()
+        digest = hashlib.sha256(np.array(self.pixels.shape, np.int64).tobytes())
+        digest.update(np.ascontiguousarray(self.pixels).data)
+        return digest.digest()
 
     @cached_property
     def mean(self) -> np.ndarray:
@@ -109,7 +111,9 @@ class SkyMap:
             weights, row_pdfs = node_weights(self.pixels)
             texels = on_device(self.pixels.reshape(-1, 3), wp.vec3, device)
             rows = on_device(row_pdfs.astype(np.float32), wp.float32, device)
-            self.arrays[device.alias] = (texels, AliasTable.build(weights).on(device), rows)
+            table = AliasTable.build(weights, overwrite=True)
+            del weights  # of a large map these are 0.3 GB
+            self.arrays[device.alias] = (texels, table.on(device), rows)
             self.watch = self.watch or Watch([(self, ("pixels", "arrays"))])
         return self.arrays[device.alias]
 
@@ -138,7 +142,8 @@ def node_weights(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     same. The densities are float64 [height + 1].
     """
     height, width = pixels.shape[:2]
-    weights = pixels.astype(np.float64) @ LUMINANCE * node_areas(height, width)[:, None]
+    weights = luminance_of(pixels)
+    weights *= node_areas(height, width)[:, None]
     return weights, _patch_sines(height) / weights.sum()
 
 
@@ -149,7 +154,7 @@ def _sun_tables(pixels: np.ndarray, parts: MapSplit, rest: SkyMap, device: wp.De
     rows = all_nodes // pixels.shape[1]
     areas = node_areas(*pixels.shape[:2])
     weights = (colors[all_nodes] - others[all_nodes]).astype(np.float64) @ LUMINANCE * areas[rows]
-    whole = float((others @ LUMINANCE).reshape(pixels.shape[:2]).sum(1, dtype=np.float64) @ areas)
+    whole = float(luminance_of(rest.pixels).sum(1, dtype=np.float64) @ areas)
     suns = np.zeros(len(parts.nodes), apart_lights.Sun.numpy_dtype())
     ends = np.cumsum([len(nodes) for nodes in parts.nodes])
     sums = np.empty(len(all_nodes))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warp_gi.color import LUMINANCE
+from warp_gi.color import LUMINANCE, luminance_of
 from warp_gi.scene.sky import node_solid_angles
 
 MOST_SUNS = 8
@@ -48,7 +48,7 @@ def split_map(
     """
     height, width = pixels.shape[:2]
     areas = node_solid_angles(height, width)
-    luminance = pixels @ LUMINANCE
+    luminance = luminance_of(pixels)
     whole = float(areas @ luminance.sum(axis=1))
     limit = brighter_than * whole / (4 * math.pi)
     rows, columns = np.nonzero(luminance > limit)

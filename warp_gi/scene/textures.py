@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from warp_gi.color import SRGB_TO_LINEAR
+from warp_gi.color import BAND, SRGB_TO_LINEAR
 from warp_gi.errors import SceneError
 from warp_gi.kernels import types
 from warp_gi.scene.model import Material, Texture
@@ -168,27 +168,31 @@ def texture_coordinates(texture: Texture, uvs: np.ndarray, further_uvs: np.ndarr
     return uvs @ rows[:, :2].T + rows[:, 2]
 
 
+def linear_shades(texture: Texture) -> np.ndarray:
+    """Return the linear values of 8-bit red, green and blue, float32 [256]."""
+    return SRGB_TO_LINEAR if texture.srgb else np.arange(256, dtype=np.float32) / 255.0
+
+
 def linear_rgb(texture: Texture) -> np.ndarray:
     """Return float32 [height, width, 3], linear, row 0 at the top."""
     rgb = texture.pixels[..., :3]
     return SRGB_TO_LINEAR[rgb] if texture.srgb else rgb.astype(np.float32) / 255.0
 
 
-def box_means(image: np.ndarray, wrap: tuple[str, str], low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def box_means(
+    image: np.ndarray, wrap: tuple[str, str], low: np.ndarray, high: np.ndarray, shades: np.ndarray | None = None
+) -> np.ndarray:
     """Return the means of the texels that bilinear lookups in uv boxes can read, float64 [n, channel].
 
-    ``image`` is [height, width, channel] with values from 0 to 1, row 0 at the top; ``low``
-    and ``high`` are the corners of the boxes, [n, 2], v up. One texel around is counted in.
+    ``image`` is [height, width, channel] with values from 0 to 1, row 0 at the top; or uint8, of which ``shades`` [256]
+    are the values. ``low`` and ``high`` are the corners of the boxes, [n, 2], v up. One texel around is counted in.
     Sums are exact integers (steps of 2^-24, rounded up), so a mean is zero only where every
-    lookup gives zero.
+    lookup gives zero. They take the memory of some rows, however large the image.
     """
-    steps = np.ceil(image[::-1].astype(np.float64) * 2.0**24).astype(np.int64)
-    for axis, mode in ((1, wrap[0]), (0, wrap[1])):
-        if mode == "mirror":
-            steps = np.concatenate([steps, np.flip(steps, axis)], axis)
     ranges = []
     for axis, mode in ((1, wrap[0]), (0, wrap[1])):
-        size, texels = steps.shape[axis], image.shape[axis]
+        texels = image.shape[axis]
+        size = 2 * texels if mode == "mirror" else texels
         begin = np.floor(low[:, 1 - axis].astype(np.float64) * texels - 0.5) - 1.0
         end = np.floor(high[:, 1 - axis].astype(np.float64) * texels - 0.5) + 3.0
         if mode == "clamp":
@@ -197,21 +201,45 @@ def box_means(image: np.ndarray, wrap: tuple[str, str], low: np.ndarray, high: n
             whole, wrapped = end - begin >= size, np.mod(begin, size)
             begin, end = np.where(whole, 0, wrapped), np.where(whole, size, wrapped + end - begin)
         ranges.append((begin.astype(np.int64), end.astype(np.int64)))
-    height, width = steps.shape[:2]
-    sums = np.zeros((height + 1, width + 1, steps.shape[2]), np.int64)
-    steps.cumsum(0, out=steps).cumsum(1, out=sums[1:, 1:])
-
-    def below(row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        """Return the sum over all rows and columns before these, with the image repeated once."""
-        (rows, row), (columns, column) = np.divmod(row, height), np.divmod(column, width)
-        rows, columns = rows[:, None], columns[:, None]
-        return (
-            sums[row, column]
-            + rows * sums[height, column]
-            + columns * sums[row, width]
-            + rows * columns * sums[height, width]
-        )
-
+    size = tuple(image.shape[axis] * (2 if wrap[1 - axis] == "mirror" else 1) for axis in (0, 1))
     (left, right), (bottom, top) = ranges
-    total = below(top, right) - below(bottom, right) - below(top, left) + below(bottom, left)
+    rows, row = np.divmod(np.stack([top, bottom, bottom, top]), size[0])  # the image is repeated once
+    columns, column = np.divmod(np.stack([right, left, right, left]), size[1])
+    ends = [np.full_like(row, end) for end in size]
+    asked = np.stack([row, ends[0], row, ends[0]]), np.stack([column, column, ends[1], ends[1]])
+    sums = _prefix_sums(image, wrap, shades, asked[0].ravel(), asked[1].ravel()).reshape(4, 4, len(low), -1)
+    whole = np.stack([np.ones_like(rows), rows, columns, rows * columns])[..., None]
+    below = (whole * sums).sum(axis=0)
+    total = below[0] + below[1] - below[2] - below[3]
     return total / (2.0**24 * (right - left) * (top - bottom))[:, None]
+
+
+def _prefix_sums(
+    image: np.ndarray, wrap: tuple[str, str], shades: np.ndarray | None, rows: np.ndarray, columns: np.ndarray
+) -> np.ndarray:
+    """Return sums of steps of 2^-24 over all rows (from the bottom) and columns before these, int64 [n, channel]."""
+    height = image.shape[0]
+    steps = None if shades is None else _steps(np.asarray(shades))
+    order = np.argsort(rows, kind="stable")
+    starts = np.flatnonzero(np.diff(rows[order], prepend=-1))
+    result = np.empty((len(rows), image.shape[2]), np.int64)
+    total, done = np.int64(0), 0
+    most = max(BAND // image.shape[1], 1)
+    for start, stop in zip(starts, [*starts[1:], len(order)], strict=True):
+        row = int(rows[order[start]])
+        while done < row:
+            some = np.arange(done, min(done + most, row))
+            band = image[height - 1 - np.where(some < height, some, 2 * height - 1 - some)]
+            total = total + (_steps(band) if steps is None else steps[band]).sum(axis=0)
+            done += len(some)
+        line = np.zeros((image.shape[1], image.shape[2]), np.int64) + total
+        if wrap[0] == "mirror":
+            line = np.concatenate([line, line[::-1]])
+        before = np.concatenate([np.zeros((1, image.shape[2]), np.int64), line.cumsum(axis=0)])
+        result[order[start:stop]] = before[columns[order[start:stop]]]
+    return result
+
+
+def _steps(values: np.ndarray) -> np.ndarray:
+    """Return values from 0 to 1 in steps of 2^-24, rounded up, int64."""
+    return np.ceil(values.astype(np.float64) * 2.0**24).astype(np.int64)

@@ -20,6 +20,8 @@ import numpy as np
 
 from warp_gi import launch
 from warp_gi.errors import OptionError, SceneError, one_line
+from warp_gi.memory import check_memory
+from warp_gi.openimageio import native_name, open_image, reason
 
 HALF_MAX = 65504.0
 
@@ -83,7 +85,7 @@ def plain(value: object) -> str | int | float:
         return int(value) if -(2**31) <= int(value) < 2**31 else str(int(value))
     if isinstance(value, float | np.floating):
         return float(np.float32(value))
-    return str(value)
+    return str(value).encode("utf-8", "backslashreplace").decode()  # names of files may hold what is not UTF-8
 
 
 def write_exr(
@@ -127,7 +129,7 @@ def write_exr(
         try:
             OpenEXR.set_global_thread_count(threads if threads > 1 else 0)
             with OpenEXR.File(header, channels) as file:
-                file.write(str(path))
+                file.write(native_name(path))
         except RuntimeError as error:
             raise OSError(f"cannot write {path}: {one_line(str(error), 'unknown failure')}") from error
         finally:
@@ -135,27 +137,35 @@ def write_exr(
 
 
 def read_exr(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Attribute], dict[str, str]]:
-    """Read an EXR file: its buffers by name, its attributes, and the format ("half", "float") of each buffer.
+    """Read an EXR file (or HDR): its buffers by name, its attributes, and the format ("half", "float") of each buffer.
 
     Buffers are float32 [height, width] or [height, width, channels], identifiers int32; a
     file by another program gives its layers by the same rules. Matrices come back as float32
     [4, 4] or [3, 3], pairs as [2]. Raises SceneError when the file is missing, torn or not an EXR.
     """
-    import OpenImageIO as oiio
-
     if not Path(path).is_file():
         raise SceneError(f"{path}: no such file")
-    source = oiio.ImageInput.open(str(path))
+    try:
+        return _read(Path(path))
+    except UnicodeDecodeError as error:  # names or texts of its header
+        raise SceneError(f"{path}: not a whole EXR file (its header holds text that is not UTF-8)") from error
+
+
+def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Attribute], dict[str, str]]:
+    kind, source = path.suffix[1:].upper() or "EXR", open_image(path)
     if source is None:
-        raise SceneError(f"{path}: not a whole EXR file ({one_line(oiio.geterror())})")
+        raise SceneError(f"{path}: not a whole {kind} file ({reason()})")
     try:
         spec = source.spec()
+        if spec.deep:  # what OpenImageIO would return are no pixels, but what lay in memory
+            raise SceneError(f"{path}: deep EXR, which has no one value a pixel; flatten it first")
+        check_memory(f"{path}: {spec.width}x{spec.height} pixels", 8 * spec.image_pixels() * spec.nchannels)
         pixels = source.read_image("float")
-        problem = source.geterror()  # missing scan lines are reported here, with zeros in the pixels
+        problem = reason(source, "")  # missing scan lines are reported here, with zeros in the pixels
     finally:
         source.close()
     if pixels is None or problem:
-        raise SceneError(f"{path}: not a whole EXR file ({one_line(problem, 'no pixels')})")
+        raise SceneError(f"{path}: not a whole {kind} file ({problem or 'no pixels'})")
     formats = [str(format) for format in spec.channelformats] or [str(spec.format)] * spec.nchannels
     groups: dict[str, list[int]] = {}
     for index, channel in enumerate(spec.channelnames):

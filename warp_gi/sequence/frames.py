@@ -16,7 +16,7 @@ from typing import Protocol
 
 import numpy as np
 
-from warp_gi.errors import OptionError, SceneError
+from warp_gi.errors import GiError, OptionError, SceneError, one_line
 from warp_gi.files import frame_path, replacing, user_path
 from warp_gi.scene.camera import Camera
 from warp_gi.scene.pinhole import offset_text
@@ -226,7 +226,16 @@ def write_preview(frame: HasBuffers, path: str | Path, exposure: float = 0.0) ->
 
 def read_frame(path: str | Path) -> FrameFile:
     """Read a frame's buffers and metadata back; raises SceneError when the file is missing or not whole."""
-    buffers, attributes, formats = read_exr(user_path(path))
+    try:
+        return _frame_file(*read_exr(user_path(path)))
+    except GiError:
+        raise
+    except (ValueError, TypeError, KeyError, IndexError, OverflowError, np.linalg.LinAlgError) as error:
+        raise SceneError(f"{path}: what it says of its frame cannot be ({one_line(error)}); render it again") from error
+
+
+def _frame_file(buffers: dict[str, np.ndarray], attributes: dict[str, Attribute], formats: dict[str, str]) -> FrameFile:
+    """Return a frame of what its file holds."""
     numbers = {name: value for name, value in attributes.items() if not isinstance(value, np.ndarray)}
     apart = TIMES, MEASURED
     metadata = {k[len(PREFIX) :]: v for k, v in numbers.items() if k.startswith(PREFIX) and not k.startswith(apart)}
@@ -264,7 +273,7 @@ def why_not_whole(
     """
     try:
         frame = read_frame(path)
-    except (SceneError, OptionError):
+    except GiError:
         return "missing" if not Path(path).is_file() else "not whole"
     size = next(iter(frame.buffers.values())).shape[1::-1]
     if camera is not None and size != camera.resolution:

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_gi.errors import SceneError
-from warp_gi.scene.files.images import find_file, read_image
+from warp_gi.scene.files.images import OutsideError, check_inside, find_file, read_image
 from warp_gi.scene.files.support import Findings
 from warp_gi.scene.files.text import decode, joined, read_bytes, uncommented, without_comment
 from warp_gi.scene.model import Material, Texture
@@ -264,12 +264,16 @@ class MtlReader:
             what, bare = self._what(name, material), re.split(r"[\\/]", name)[-1]
             tries = [(folder, name), (self.path.parent, name), (folder, bare)]
             if ELSEWHERE.match(name):
+                if os.path.isabs(name):
+                    check_inside(Path(name), what)
                 if os.path.isfile(name):
                     return Path(name)
                 tries = [(folder, bare)]
             for place, candidate in tries:
                 try:
                     return find_file(place, candidate, what)
+                except OutsideError:
+                    raise
                 except SceneError as error:
                     missing = missing or error
         if ELSEWHERE.match(name):

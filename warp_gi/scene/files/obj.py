@@ -10,7 +10,7 @@ import numpy as np
 
 from warp_gi.color import decode_srgb
 from warp_gi.errors import SceneError
-from warp_gi.scene.files.images import find_file
+from warp_gi.scene.files.images import OutsideError, check_inside, find_file
 from warp_gi.scene.files.mtl import ELSEWHERE, MtlMaterial, MtlReader, read_mtl, unquoted
 from warp_gi.scene.files.obj_text import ObjStatements, parse
 from warp_gi.scene.files.parts import SceneParts
@@ -69,10 +69,14 @@ def _libraries(line: str, path: Path, findings: Findings) -> list[Path]:
     for names in ([unquoted(line)], line.split(), [unquoted(short)], short.split()):
         found, missing = [], None
         for name in names:
-            bare = re.split(r"[\\/]", name)[-1]
+            bare, what = re.split(r"[\\/]", name)[-1], f"{str(path)!r}: material library"
             try:
+                if os.path.isabs(name):
+                    check_inside(Path(name), f"{what} {name!r}")
                 place = bare if ELSEWHERE.match(name) and not os.path.isfile(name) else name
-                found.append(find_file(path.parent, place, f"{str(path)!r}: material library"))
+                found.append(find_file(path.parent, place, what))
+            except OutsideError:
+                raise
             except SceneError as error:
                 missing = missing or error
         if missing is None:

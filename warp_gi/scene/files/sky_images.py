@@ -15,11 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from warp_gi.color import RGB_FROM_XYZ, decode_srgb, rgb_from_primaries
-from warp_gi.errors import SceneError, one_line
+from warp_gi.color import RGB_FROM_XYZ, bands, decode_srgb, rgb_from_primaries
+from warp_gi.errors import SceneError
 from warp_gi.files import user_path
+from warp_gi.openimageio import open_image, reason
 
 LARGEST_HEIGHT = 4096  # texel coordinates must be exact in float32 with bits left to interpolate
+MOST_HEADER = 1 << 20  # bytes in which the header of a Radiance picture ends
 LARGEST_WINDOW = 4 * LARGEST_HEIGHT  # pixels a side of a data window, which may be larger than the display window
 BEAUTY = ("beauty", "combined", "rgba", "rgb", "default")
 """Names, in lower case, of parts and layers that hold the picture itself, the likeliest first."""
@@ -116,9 +118,9 @@ def _read_pixels(path: Path, name: str, wanted: str, orientation: int = 0) -> np
     """Return what ``read_sky`` does; ``orientation`` 0 is what the file's attribute says."""
     import OpenImageIO as oiio
 
-    image = oiio.ImageInput.open(str(path))
+    image = open_image(path)
     if image is None:
-        raise SceneError(f"{name}: not an image that can be read ({one_line(oiio.geterror(), 'no reason given')})")
+        raise SceneError(f"{name}: not an image that can be read ({reason()})")
     try:
         layer = _choose(_layers(image, name), wanted, name, path)
         spec = image.spec(layer.part)
@@ -132,23 +134,43 @@ def _read_pixels(path: Path, name: str, wanted: str, orientation: int = 0) -> np
                 f"{name}: its data window is {spec.width}x{spec.height}, at most {LARGEST_WINDOW} a side is supported;"
                 " crop it to the display window"
             )
-        first, last = min(layer.channels), max(layer.channels)
-        pixels = image.read_image(layer.part, 0, first, last + 1, oiio.FLOAT)
+        first = layer.channels[0]
+        if layer.channels == (first, first + 1, first + 2):
+            pixels = _read_channels(image, spec, layer.part, first, first + 3)
+        else:
+            read = [_read_channels(image, spec, layer.part, one, one + 1) for one in layer.channels]
+            known = [one for one in read if one is not None]
+            pixels = np.concatenate(known, axis=2) if len(known) == 3 else None
         if pixels is None or image.has_error:
-            raise SceneError(
-                f"{name}: the image is damaged or cut short ({one_line(image.geterror(), 'no reason given')})"
-            )
+            raise SceneError(f"{name}: the image is damaged or cut short ({reason(image)})")
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{name}: the image is damaged, or has names that are not UTF-8; write it anew") from error
     finally:
         image.close()
-    pixels = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, last + 1 - first)
-    pixels = pixels[..., [channel - first for channel in layer.channels]]
     if spec.format.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE):
-        pixels = decode_srgb(pixels)
+        for rows in bands(spec.height, spec.width):
+            pixels[rows] = decode_srgb(pixels[rows])
     pixels = _upright(_in_display_window(pixels, spec), orientation)
     chromaticities = spec.getattribute("chromaticities")
     if chromaticities is not None:
         pixels = _converted(pixels, tuple(chromaticities), name)
     return np.ascontiguousarray(pixels, np.float32)
+
+
+def _read_channels(image: Any, spec: Any, part: int, first: int, end: int) -> np.ndarray | None:
+    """Return channels of a part, float32 [height, width, channel], read some rows at a time; None if they cannot be."""
+    import OpenImageIO as oiio
+
+    if spec.tile_width:
+        pixels = image.read_image(part, 0, first, end, oiio.FLOAT)
+        return None if pixels is None else np.asarray(pixels, np.float32).reshape(spec.height, spec.width, end - first)
+    result = np.empty((spec.height, spec.width, end - first), np.float32)
+    for rows in bands(spec.height, spec.width):
+        read = image.read_scanlines(part, 0, spec.y + rows.start, spec.y + rows.stop, 0, first, end, oiio.FLOAT)
+        if read is None:
+            return None
+        result[rows] = np.asarray(read).reshape(result[rows].shape)
+    return result
 
 
 def _layers(image: Any, name: str) -> list[Layer]:
@@ -162,7 +184,7 @@ def _layers(image: Any, name: str) -> list[Layer]:
             found += _layers_of(spec, part)
         part += 1
     image.seek_subimage(0, 0)
-    image.geterror()  # some readers keep that there was no further part, as if reading had failed
+    reason(image)  # some readers keep that there was no further part, as if reading had failed
     first = image.spec(0)
     if found:
         return found
@@ -245,29 +267,43 @@ def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
 def _converted(pixels: np.ndarray, chromaticities: tuple[float, ...], name: str) -> np.ndarray:
     """Return colors in Rec. 709 of those in other primaries (x and y of red, green, blue and white)."""
     if np.allclose(chromaticities[:6], XYZ_PRIMARIES, atol=1e-6):
-        return pixels @ RGB_FROM_XYZ.T
+        return _times(pixels, RGB_FROM_XYZ.T)
     matrix = rgb_from_primaries(chromaticities)
     if matrix is None:
         raise SceneError(f"{name}: chromaticities {chromaticities} span no colors; repair or remove the attribute")
     if np.allclose(matrix, np.eye(3), atol=1e-3):  # as far as rounded chromaticities of Rec. 709 are from it
         return pixels
-    return pixels @ matrix.T
+    return _times(pixels, matrix.T)
+
+
+def _times(pixels: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Return pixels times a matrix (computed in float64), float32 [height, width, 3]."""
+    result = np.empty(pixels.shape, np.float32)
+    for rows in bands(*pixels.shape[:2]):
+        result[rows] = pixels[rows] @ matrix
+    return result
 
 
 def _read_radiance(path: Path, name: str, layer: str) -> np.ndarray:
-    data = path.read_bytes()
+    with path.open("rb") as file:
+        data = file.read(MOST_HEADER)
     header = parse_radiance(data, name)
     if header.is_xyz:  # the same coding, under a name that OpenImageIO refuses
         with tempfile.TemporaryDirectory() as folder:
             copy = Path(folder) / "sky.hdr"
+            data = path.read_bytes()
             copy.write_bytes(re.sub(rb"(?m)^FORMAT=\s*32-bit_rle_xyze", b"FORMAT=32-bit_rle_rgbe", data, count=1))
             pixels = _read_pixels(copy, name, layer, header.orientation)
-        pixels = pixels @ RGB_FROM_XYZ.T
+        pixels = _times(pixels, RGB_FROM_XYZ.T)
     else:
         pixels = _read_pixels(path, name, layer, header.orientation)
         if header.primaries is not None:
             pixels = _converted(pixels, header.primaries, name)
-    return np.ascontiguousarray(pixels / header.scale, np.float32)
+    pixels = np.ascontiguousarray(pixels)
+    if (header.scale != 1).any():
+        for rows in bands(*pixels.shape[:2]):
+            pixels[rows] = pixels[rows] / header.scale
+    return pixels
 
 
 def parse_radiance(data: bytes, name: str) -> RadianceHeader:

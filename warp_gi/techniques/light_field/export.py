@@ -20,6 +20,7 @@ from warp_gi.baking import Bake
 from warp_gi.errors import BakeError, OptionError
 from warp_gi.files import replacing
 from warp_gi.kernels import light_field as field_kernels
+from warp_gi.openimageio import open_image, reason
 from warp_gi.sequence.exr import HALF_MAX
 from warp_gi.techniques.light_field.state import baked_resolution
 from warp_gi.techniques.shared.octahedral import decode, encode, texels_of
@@ -235,15 +236,13 @@ def read_atlases(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any
     Atlases are float16 or float32 [row, column, channel] by their names in ``ATLASES``, as they are in the files.
     Raises OSError when a file is missing or torn.
     """
-    import OpenImageIO as oiio
-
     info = json.loads(Path(path).read_text())
     images = {}
     for name, atlas in info["atlases"].items():
-        source = oiio.ImageInput.open(str(Path(path).parent / atlas["file"]))
+        source = open_image(Path(path).parent / atlas["file"])
         pixels = source.read_image(atlas["type"]) if source else None
         if source is None or pixels is None or source.has_error:
-            (source or oiio).geterror()  # taken, so that it is not printed when the program ends
+            reason(source)  # taken, so that it is not printed when the program ends
             raise OSError(f"{atlas['file']}: expected a whole EXR file beside {Path(path).name}; export again")
         images[name] = pixels.reshape(*pixels.shape[:2], -1)
     return images, info

@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from warp_gi.errors import BakeError, one_line
+from warp_gi.errors import BakeError
+from warp_gi.openimageio import open_image, reason
 
 
 class Part(NamedTuple):
@@ -55,7 +56,7 @@ def write_exr_parts(file: Path, path: Path, parts: Sequence[Part], attributes: d
         done = done and output.write_image(np.ascontiguousarray(part.pixels()))
     done = output.close() and done
     if not done or output.has_error:
-        problem = one_line(output.geterror(), "unknown failure")
+        problem = reason(output, "unknown failure")
         raise OSError(f"cannot write {path}: {problem.replace(str(file), str(path))}")
 
 
@@ -64,13 +65,11 @@ def read_exr_parts(path: str | Path) -> tuple[dict[str, dict[str, np.ndarray]], 
 
     Raises BakeError when the file is missing, torn or no EXR file.
     """
-    import OpenImageIO as oiio
-
     if not Path(path).is_file():
         raise BakeError(f"{path}: no such file; it belongs to the export, which has to be written again")
-    source = oiio.ImageInput.open(str(path))
+    source = open_image(path)
     if source is None or source.format_name() != "openexr":
-        oiio.geterror()  # taken, so that it is not printed when the program ends; pages of it for a few bytes missing
+        reason()  # taken, so that it is not printed when the program ends; pages of it for a few bytes missing
         raise BakeError(f"{path}: not a whole EXR file; export again")
     images: dict[str, dict[str, np.ndarray]] = {}
     texts: dict[str, str] = {}
@@ -85,9 +84,9 @@ def read_exr_parts(path: str | Path) -> tuple[dict[str, dict[str, np.ndarray]], 
             name = spec.get_string_attribute("oiio:subimagename") or str(len(images))
             images[name] = {channel: pixels[..., at] for at, channel in enumerate(spec.channelnames)}
             texts |= {item.name: item.value for item in spec.extra_attribs if isinstance(item.value, str)}
-        problem = source.geterror() if source.has_error else ""
+        problem = reason(source) if source.has_error else ""
     finally:
         source.close()
     if problem or not images:
-        raise BakeError(f"{path}: not a whole EXR file ({one_line(problem, 'no pixels')}); export again")
+        raise BakeError(f"{path}: not a whole EXR file ({problem or 'no pixels'}); export again")
     return images, texts
