@@ -13,7 +13,7 @@ from warp_gi.kernels import types
 from warp_gi.scene.geometry import FlatGeometry, placed_points, triangle_areas
 from warp_gi.scene.model import Material, Node, PunctualLight
 from warp_gi.scene.poses import poses
-from warp_gi.scene.textures import box_means, linear_rgb, texture_coordinates
+from warp_gi.scene.textures import channel_sums, texture_coordinates
 
 LIGHT_KINDS = {
     "point": types.EMITTER_POINT,
@@ -89,23 +89,43 @@ def emissive_triangles(flat: FlatGeometry, materials: Sequence[Material]) -> tup
     triangles = np.flatnonzero(shining[flat.materials])
     powers = np.pi * emitting_areas(flat, triangles)
     powers[powers < np.pi * SMALLEST_AREA] = 0.0
+    shares = _texture_means(flat, materials, triangles)
     for index in np.flatnonzero(shining).tolist():
         mine = flat.materials[triangles] == index
         material = materials[index]
         radiance = np.asarray(material.emission, np.float64)
         if material.emission_texture is not None:
-            texture = material.emission_texture
-            ids = flat.indices[triangles[mine]]
-            further = None if flat.further_uvs is None else flat.further_uvs[ids]
-            uvs = texture_coordinates(texture, flat.uvs[ids], further)
-            image, low, high = linear_rgb(texture), uvs.min(axis=1), uvs.max(axis=1)
-            means = [box_means(image[..., k : k + 1], texture.wrap, low, high) for k in range(3)]
-            radiance = radiance * np.concatenate(means, axis=1)
+            radiance = radiance * shares[mine]
         if material.colors_emit and flat.colors is not None:
             radiance = radiance * flat.colors[flat.indices[triangles[mine]], :3].astype(np.float64).mean(axis=1)
         powers[mine] *= radiance @ LUMINANCE * (2.0 if material.double_sided else 1.0)
     kept = powers > 0.0
     return triangles[kept], powers[kept]
+
+
+def _texture_means(flat: FlatGeometry, materials: Sequence[Material], triangles: np.ndarray) -> np.ndarray:
+    """Return the mean of the emission's texture under each of these triangles, float64 [count, 3]; 1 without any.
+
+    Sums over a texture are made once for all materials that share it, and one channel after the other, for memory.
+    """
+    means, low, high = np.ones((len(triangles), 3)), *np.zeros((2, len(triangles), 2))
+    of_material, sharing = flat.materials[triangles], dict[tuple[object, ...], list[int]]()
+    for index in np.unique(of_material).tolist():
+        texture = materials[index].emission_texture
+        if texture is None:
+            continue
+        mine = of_material == index
+        ids = flat.indices[triangles[mine]]
+        further = None if flat.further_uvs is None else flat.further_uvs[ids]
+        uvs = texture_coordinates(texture, flat.uvs[ids], further)
+        low[mine], high[mine] = uvs.min(axis=1), uvs.max(axis=1)
+        sharing.setdefault((id(texture.pixels), texture.srgb, texture.wrap), []).append(index)
+    for group in sharing.values():
+        texture, mine = materials[group[0]].emission_texture, np.isin(of_material, group)
+        assert texture is not None
+        for channel in range(3):
+            means[mine, channel] = channel_sums(texture, channel).means(low[mine], high[mine])[:, 0]
+    return means
 
 
 def mean_areas(

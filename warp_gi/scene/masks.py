@@ -12,7 +12,7 @@ from warp_gi.bvh import AlphaMasks
 from warp_gi.color import LUMINANCE
 from warp_gi.scene.geometry import FlatGeometry
 from warp_gi.scene.model import Material, Texture
-from warp_gi.scene.textures import box_means, linear_rgb, texture_coordinates
+from warp_gi.scene.textures import BoxSums, linear_rgb, texture_coordinates
 
 
 def alpha_masks(
@@ -33,6 +33,7 @@ def alpha_masks(
     face_mask = np.full(len(flat.indices), -1, np.int32)
     masks: list[tuple[int, float, float | None]] = []
     glass: dict[int, tuple[float, int, float, float]] = {}
+    holes: dict[tuple[object, ...], BoxSums] = {}  # of the texture looked at last: more would cost memory
     alphas = None if flat.colors is None else np.ascontiguousarray(flat.colors[:, 3])
     for index, material in enumerate(materials):
         if not material.lets_rays_pass:
@@ -46,9 +47,12 @@ def alpha_masks(
         if texture is None:
             holed = triangles if material.alpha * thinnest < whole else triangles[:0]
         else:
-            cut = texture.pixels[..., 3:] * (material.alpha * thinnest / 255.0) < whole
+            key = id(texture.pixels), texture.wrap, material.alpha * thinnest, whole
+            if key not in holes:  # materials may share a texture
+                cut = texture.pixels[..., 3:] * (material.alpha * thinnest / 255.0) < whole
+                holes = {key: BoxSums(cut.astype(np.int64), texture.wrap)}
             uvs = flat.uvs[flat.indices[triangles]]
-            holed = triangles[box_means(cut, texture.wrap, uvs.min(axis=1), uvs.max(axis=1))[:, 0] > 0.0]
+            holed = triangles[holes[key].means(uvs.min(axis=1), uvs.max(axis=1))[:, 0] > 0.0]
         if material.is_glass:
             holed = triangles
             tint = tints.get(index)
