@@ -100,7 +100,7 @@ class Scene:
         if not np.isfinite(self._flat.points).all():
             raise SceneError(f"scene {self.name!r}: node transforms move vertices past the range of float32")
         times = np.linspace(0.0, self.duration, POSES_FOR_AREAS)
-        self._flat.mean_areas = emitters.mean_areas(self.nodes, self._flat, self._hulls, times)
+        self._flat.mean_areas = emitters.mean_areas(self.nodes, self._flat, self._moving, times)
         self._emissive, powers = emitters.emissive_triangles(self._flat, self.materials)
         self._light_grids = LightGrids(self._flat, self.materials, self._emissive, powers)
         self._bounds = self._all_bounds()
