@@ -283,7 +283,9 @@ def test_lamps_shine_that_have_no_area_when_the_scene_is_made(how):
     rest = [gi.Node("floor", [floor]), gi.Node("beside", [beside])]
     scene, alike = gi.Scene([*lamps, *rest]), gi.Scene([still, *rest])
     assert scene.emitter_count == alike.emitter_count == 4
-    assert (scene.emitter_powers() > 0).all() and scene.emitter_powers()[2:] == pytest.approx(alike.emitter_powers()[2:])
+    assert (scene.emitter_powers() > 0).all() and scene.emitter_powers()[2:] == pytest.approx(
+        alike.emitter_powers()[2:]
+    )
     times = gi.CameraPath.from_cameras([view()] * 4, fps=10)
     for lights, spp in ((gi.LightHierarchy(), 64), (gi.PowerLights(), 512)):
         pipeline = gi.Pipeline(environment=None, emitters=lights, indirect=None, spp=spp)

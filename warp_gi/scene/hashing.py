@@ -28,6 +28,14 @@ def geometry_hash(scene: SceneContents) -> str:
         _update(digest, triangles, flat.materials[triangles], flat.uvs[flat.indices[triangles]])
         if flat.colors is not None:
             _update(digest, flat.colors[flat.indices[triangles], 3])
+        second = np.array(
+            [
+                m.is_glass and m.transmission_texture is not None and m.transmission_texture.uv_set != 0
+                for m in scene.materials
+            ]
+        )[flat.materials]
+        if flat.further_uvs is not None and second.any():
+            _update(digest, flat.further_uvs[flat.indices[second]])
         for material in (m for m in scene.materials if m.lets_rays_pass):
             _update(digest, *textures.visibility_parts(material))
     for index, node in enumerate(scene.nodes):
