@@ -8,7 +8,7 @@ from emission_tools import floor, image, looks, panel, reflected, view
 import warp_gi as gi
 from warp_gi.kernels.emission_grids import emitter_point, emitter_point_density
 from warp_gi.kernels.types import SceneData
-from warp_gi.scene import emission_grids
+from warp_gi.scene import emission_grids, emitters
 
 REPEAT, CLAMP, MIRROR = ("repeat", "repeat"), ("clamp", "clamp"), ("mirror", "mirror")
 COLORS = np.array([[1, 0, 0], [0, 1, 0], [1, 1, 1], [0.1, 0.2, 1]], np.float32)
@@ -202,3 +202,32 @@ def test_a_texture_edited_before_the_first_picture_is_the_one_that_is_sampled():
     pixels[..., :3] = np.roll(pixels[..., :3], 9, axis=1)
     with pytest.raises(gi.SceneError, match="changed"):
         scene.check_unchanged()
+
+
+def test_materials_that_share_a_texture_share_its_sums(monkeypatch):
+    """Powers are those of each material alone, and sums are made once for a picture."""
+    rng = np.random.default_rng(8)
+    pixels, others = rng.integers(0, 256, (2, 16, 24, 4), dtype=np.uint8)
+    shifted = ((0.5, 0.0, 0.2), (0.0, 2.0, 0.1))
+    textures = [
+        gi.Texture("a", pixels),
+        gi.Texture("b", pixels),
+        gi.Texture("moved", pixels, transform=shifted),
+        gi.Texture("mirrored", pixels, wrap=("mirror", "clamp")),
+        gi.Texture("linear", pixels, srgb=False),
+        gi.Texture("other", others),
+    ]
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
+    nodes = []
+    for number, texture in enumerate(textures):
+        material = gi.Material(str(number), emission=(1.0 + number, 2.0, 0.5), emission_texture=texture)
+        uvs = rng.uniform(-0.5, 1.5, (4, 2)).astype(np.float32)
+        indices = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+        nodes.append(gi.Node(str(number), [gi.Mesh(corners, indices, material, uvs=uvs)]))
+    alone = np.concatenate([gi.Scene([node])._light_grids._inputs[3] for node in nodes])
+    made = []
+    real = emitters.box_means
+    monkeypatch.setattr(emitters, "box_means", lambda *which: made.append(which) or real(*which))
+    together = gi.Scene(nodes)._light_grids._inputs[3]
+    assert np.array_equal(together, alone) and len(set(alone)) > 8
+    assert len(made) == 4

@@ -145,6 +145,24 @@ def test_transmission_textures_elsewhere_are_named(tmp_path, info):
     assert [("coordinates of transmission textures" in str(one.message)) for one in caught] == [True] * bool(info)
 
 
+def test_transmission_textures_without_one_of_the_colour_stand_where_they_say(tmp_path):
+    """The right half is clear by the second set, the left half by the first, which is the normal map's."""
+    glb = square({"pbrMetallicRoughness": {"metallicFactor": 0}}, further=np.float32([1, 0]) + CORNERS * [-1, 1])
+    pixels = np.full((1, 2, 4), 255)
+    pixels[0, 1, :3] = 0
+    share, bumps = image(glb, pixels), image(glb, np.full((1, 1, 4), [128, 128, 255, 255]))
+    glb.json["materials"][0]["normalTexture"] = {"index": bumps}
+    extension = {"transmissionFactor": 1.0, "transmissionTexture": {"index": share, "texCoord": 1}}
+    glb.json["materials"][0]["extensions"] = {"KHR_materials_transmission": extension}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = loaded(glb, tmp_path)
+    low, high = scene.bounds[:, 0]
+    rays = np.float32([[low + part * (high - low), 0.1, 5.0] for part in (0.25, 0.75)])
+    face = scene.bvh("cpu").intersect(rays, np.float32([[0, 0, -1]] * 2)).face.numpy()
+    assert face[0] >= 0 and face[1] < 0
+
+
 def test_unlit_with_colors_of_vertices(tmp_path):
     glb = square({"extensions": {"KHR_materials_unlit": {}}})
     colors = glb.accessor(np.tile([0.5, 0.25, 1.0], (4, 1)))

@@ -288,6 +288,42 @@ def test_hashes_change_with_what_they_stand_for():
     assert moving.geometry_hash != base.geometry_hash
 
 
+def test_hashes_follow_edits_until_the_first_frame():
+    """A hash that is asked for early must not be that of the scene before an edit: bakes are kept by it."""
+
+    def build(color=(0.5, 0.5, 0.5), cutoff=None, light=1.0, at=0.0):
+        pixels = checker()
+        material = Material("m", color, base_color_texture=Texture("t", pixels), alpha_cutoff=cutoff)
+        lights = [PunctualLight("point", (light,) * 3, position=(at, 0.0, 0.0))]
+        return Scene([Node("n", [triangle(material, uvs=TRIANGLE_UVS)])], lights)
+
+    scene = build()
+    seen = {(scene.geometry_hash, scene.hash)}
+    material = scene.materials[0]
+    material.base_color = (0.1, 0.2, 0.3)
+    assert (scene.geometry_hash, scene.hash) == (build().geometry_hash, build((0.1, 0.2, 0.3)).hash)
+    material.alpha_cutoff = 0.5
+    scene.lights[0].intensity = (2.0, 2.0, 2.0)
+    other = build((0.1, 0.2, 0.3), 0.5, 2.0)
+    seen.add((scene.geometry_hash, scene.hash))
+    assert (scene.geometry_hash, scene.hash) == (other.geometry_hash, other.hash)
+    material.base_color_texture.pixels[0, 0, 3] = 0
+    seen.add((scene.geometry_hash, scene.hash))
+    assert len({a for a, _ in seen}) == len({b for _, b in seen}) == 3
+    scene.data("cpu")
+    assert (scene.geometry_hash, scene.hash) in seen
+
+
+def test_the_hash_follows_lights_that_frames_read_anew():
+    node = Node("lamp", [], keyframes=[Keyframe(0.0), Keyframe(1.0, (1, 0, 0))])
+    scene = Scene([node, Node("n", [triangle()])], [PunctualLight("point", (1.0, 1.0, 1.0), node=0)])
+    scene.data("cpu")
+    before = scene.hash
+    scene.lights[0].intensity = (2.0, 1.0, 1.0)
+    scene.check_unchanged()
+    assert scene.hash != before
+
+
 def test_the_environment_can_be_changed_without_a_new_build():
     scene = Scene([Node("n", [triangle()])])
     data = scene.data("cpu")

@@ -262,6 +262,38 @@ def test_a_lamp_that_grows_out_of_nothing_shines():
     assert found.frame(0).numpy("beauty").max() == 0.0
 
 
+@pytest.mark.parametrize("how", ["scaled", "scaled parent", "opens between poses"])
+def test_lamps_shine_that_have_no_area_when_the_scene_is_made(how):
+    """A panel that is closed at time 0, or at each of the times at which areas are sampled, beside one that rests."""
+    panel = quad((-0.4, 2.0, 0.4), (0.8, 0, 0), (0, 0, -0.8), LAMP, "lamp")
+    beside = quad((1.0, 2.0, 0.4), (0.8, 0, 0), (0, 0, -0.8), LAMP, "beside")
+    still = gi.Node("lamp", [panel])
+    lamps = [replace(still)]
+    if how == "scaled":
+        lamps[0].keyframes = [gi.Keyframe(0.0, scale=(0, 0, 0)), gi.Keyframe(0.3)]
+    elif how == "scaled parent":
+        keys = [gi.Keyframe(0.0, scale=(1, 1, 0)), gi.Keyframe(0.3, scale=(1, 1, 1))]
+        lamps = [gi.Node("parent", keyframes=keys), replace(still, parent=0)]
+    else:  # at 0.3 s, between 0.25 and 0.375 s
+        shut = replace(panel, points=np.tile(panel.points[:1], (4, 1)))
+        shut.targets = [gi.MorphTarget(panel.points - shut.points)]
+        keys = [(0.0, 0.0), (0.26, 0.0), (0.29, 1.0), (0.31, 1.0), (0.36, 0.0), (1.0, 0.0)]
+        lamps[0] = gi.Node("lamp", [shut], morphs=[gi.MorphKeyframe(time, (weight,)) for time, weight in keys])
+    floor = quad((-2, 0, 2), (4, 0, 0), (0, 0, -4), GREY)
+    rest = [gi.Node("floor", [floor]), gi.Node("beside", [beside])]
+    scene, alike = gi.Scene([*lamps, *rest]), gi.Scene([still, *rest])
+    assert scene.emitter_count == alike.emitter_count == 4
+    assert (scene.emitter_powers() > 0).all() and scene.emitter_powers()[2:] == pytest.approx(
+        alike.emitter_powers()[2:]
+    )
+    times = gi.CameraPath.from_cameras([view()] * 4, fps=10)
+    for lights, spp in ((gi.LightHierarchy(), 64), (gi.PowerLights(), 512)):
+        pipeline = gi.Pipeline(environment=None, emitters=lights, indirect=None, spp=spp)
+        wanted, found = (gi.FrameScheduler(one, times, pipeline, st.device().alias, 3) for one in (alike, scene))
+        expected, got = (one.frame(3).numpy("beauty").mean(axis=(0, 1)) for one in (wanted, found))
+        np.testing.assert_allclose(got, expected, rtol=0.02)
+
+
 def test_transfer_refuses_lamps_that_bend():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

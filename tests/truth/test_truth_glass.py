@@ -93,6 +93,31 @@ def test_textures_of_transmission_and_tint():
     assert abs(stopped - (1 - 128 / 255)) < 0.015
 
 
+@pytest.mark.parametrize("how", ["second set", "transform", "both"])
+def test_textures_of_transmission_have_coordinates_of_their_own(how):
+    """Left half clear, right half opaque; the second set or a transform mirrors them. A veil beside keeps its own."""
+    mirror = ((-1.0, 0.0, 1.0), (0.0, 1.0, 0.0))
+    pixels = np.uint8([[[255, 0, 0, 255], [0, 0, 0, 255]]])
+    fields = {"uv_set": int(how != "transform"), "transform": None if how == "second set" else mirror}
+    share = gi.Texture("t", pixels, False, ("clamp", "clamp"), nearest=True, **fields)
+    normal = gi.Texture("n", np.uint8([[[128, 128, 255, 255]]]), srgb=False)
+    material = glass(transmission_texture=share, normal_texture=normal, specular=0.0)
+    card = quad((-1, -1, 0), (2, 0, 0), (0, 2, 0), material, "card")
+    card.further_uvs = card.uvs * np.float32([-1, 1]) + np.float32([1, 0])
+    holes = gi.Texture("h", np.uint8([[[0, 0, 0, 255], [0, 0, 0, 0]]]), False, ("clamp", "clamp"), nearest=True)
+    veiled = gi.Material("veil", alpha_blend=True, base_color_texture=holes)
+    beside = quad((2, -1, 0), (2, 0, 0), (0, 2, 0), veiled, "beside")
+    scene = scene_of(card, beside, environment=tuple(SKY))
+    x = np.repeat([-0.5, 0.5, 2.5, 3.5], 50)
+    rays = np.stack([x, np.full(200, 0.1), np.ones(200)], axis=1) + np.linspace(0, 0.01, 200)[:, None]
+    face = scene.bvh("cpu").intersect(np.float32(rays), np.float32([[0, 0, -1]] * 200)).face.numpy()
+    left_is_clear = how == "both"
+    assert ((face >= 0).reshape(4, 50) == np.array([[not left_is_clear], [left_is_clear], [True], [False]])).all()
+    moved = replace(card, further_uvs=card.further_uvs * np.float32(0.5))
+    other = scene_of(moved, beside, environment=tuple(SKY))
+    assert (other.geometry_hash != scene.geometry_hash) == (how != "transform")
+
+
 RED = (0.9, 0.3, 0.1)
 
 

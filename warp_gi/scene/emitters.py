@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ from warp_gi.errors import SceneError
 from warp_gi.kernels import types
 from warp_gi.scene.geometry import FlatGeometry, placed_points, triangle_areas
 from warp_gi.scene.model import Material, Node, PunctualLight
-from warp_gi.scene.poses import poses
+from warp_gi.scene.poses import deforms, poses
 from warp_gi.scene.textures import box_means, linear_shades, texture_coordinates
 
 LIGHT_KINDS = {
@@ -23,6 +23,13 @@ LIGHT_KINDS = {
 
 SMALLEST_AREA = 1e-18
 """Area in square metres below which a triangle cannot be sampled in float32, and is no emitter."""
+
+
+LEAST_AREA = 0.01
+"""Least area of a triangle of a lamp that changes its size or shape, over the mean of the lamp's triangles."""
+
+UNKNOWN_AREA = 0.01
+"""Area in square metres that stands for the mean of a lamp's triangles where that is zero at all sampled times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,17 +96,13 @@ def emissive_triangles(flat: FlatGeometry, materials: Sequence[Material]) -> tup
     triangles = np.flatnonzero(shining[flat.materials])
     powers = np.pi * emitting_areas(flat, triangles)
     powers[powers < np.pi * SMALLEST_AREA] = 0.0
+    shares = _texture_means(flat, materials, triangles)
     for index in np.flatnonzero(shining).tolist():
         mine = flat.materials[triangles] == index
         material = materials[index]
         radiance = np.asarray(material.emission, np.float64)
         if material.emission_texture is not None:
-            texture = material.emission_texture
-            ids = flat.indices[triangles[mine]]
-            further = None if flat.further_uvs is None else flat.further_uvs[ids]
-            uvs = texture_coordinates(texture, flat.uvs[ids], further)
-            shades, low, high = linear_shades(texture), uvs.min(axis=1), uvs.max(axis=1)
-            radiance = radiance * box_means(texture.pixels[..., :3], texture.wrap, low, high, shades)
+            radiance = radiance * shares[mine]
         if material.colors_emit and flat.colors is not None:
             radiance = radiance * flat.colors[flat.indices[triangles[mine]], :3].astype(np.float64).mean(axis=1)
         powers[mine] *= radiance @ LUMINANCE * (2.0 if material.double_sided else 1.0)
@@ -107,22 +110,51 @@ def emissive_triangles(flat: FlatGeometry, materials: Sequence[Material]) -> tup
     return triangles[kept], powers[kept]
 
 
-def mean_areas(
-    nodes: Sequence[Node], flat: FlatGeometry, changing: Iterable[int], times: np.ndarray
-) -> np.ndarray | None:
-    """Return the area of each triangle, of lamps that change their shape as a mean over ``times`` [s].
+def _texture_means(flat: FlatGeometry, materials: Sequence[Material], triangles: np.ndarray) -> np.ndarray:
+    """Return the mean of the emission's texture under each of these triangles, float64 [count, 3]; 1 without any.
 
-    ``changing`` are the nodes that do. None if none of them emits: float64 [triangle] otherwise.
+    Sums over a texture are made once for all materials that share it.
     """
-    lamps = [i for i in changing if any(max(mesh.material.emission) > 0.0 for mesh in nodes[i].meshes)]
+    means, low, high = np.ones((len(triangles), 3)), *np.zeros((2, len(triangles), 2))
+    of_material, sharing = flat.materials[triangles], dict[tuple[object, ...], list[int]]()
+    for index in np.unique(of_material).tolist():
+        texture = materials[index].emission_texture
+        if texture is None:
+            continue
+        mine = of_material == index
+        ids = flat.indices[triangles[mine]]
+        further = None if flat.further_uvs is None else flat.further_uvs[ids]
+        uvs = texture_coordinates(texture, flat.uvs[ids], further)
+        low[mine], high[mine] = uvs.min(axis=1), uvs.max(axis=1)
+        sharing.setdefault((id(texture.pixels), texture.srgb, texture.wrap), []).append(index)
+    for group in sharing.values():
+        texture, mine = materials[group[0]].emission_texture, np.isin(of_material, group)
+        assert texture is not None
+        image, shades = texture.pixels[..., :3], linear_shades(texture)
+        means[mine] = box_means(image, texture.wrap, low[mine], high[mine], shades)
+    return means
+
+
+def mean_areas(
+    nodes: Sequence[Node], flat: FlatGeometry, moving: Sequence[bool], times: np.ndarray
+) -> np.ndarray | None:
+    """Return the area of each triangle, of lamps that change their size or shape as a mean over ``times`` [s].
+
+    A triangle of such a lamp counts with at least LEAST_AREA of the mean over the lamp, whatever it is at these times:
+    it may open between them, and what is never chosen never shines. ``moving`` says which nodes move. None if no such
+    node emits: float64 [triangle] otherwise.
+    """
+    lamps = [
+        index
+        for index, node in enumerate(nodes)
+        if moving[index] and any(max(mesh.material.emission) > 0.0 for mesh in node.meshes)
+        if deforms(node) or _changes_size(nodes, index)
+    ]
     if not lamps:
         return None
     areas, points = triangle_areas(flat.points, flat.indices), flat.points.copy()
-    vertices = flat.indices[:, 0]
-    mine = np.zeros(len(vertices), bool)
-    for index in lamps:
-        start, stop = flat.vertex_starts[index : index + 2]
-        mine |= (vertices >= start) & (vertices < stop)
+    owners = np.searchsorted(flat.vertex_starts, flat.indices[:, 0], side="right") - 1
+    mine = np.isin(owners, lamps)
     areas[mine] = 0.0
     for time in times.tolist():
         placed = poses(nodes, time)
@@ -130,7 +162,21 @@ def mean_areas(
             start, stop = flat.vertex_starts[index : index + 2]
             points[start:stop] = placed_points(nodes[index], placed[index])
         areas[mine] += triangle_areas(points, flat.indices[mine]) / len(times)
+    for index in lamps:
+        own = owners == index
+        mean = float(areas[own].mean()) if own.any() else 0.0
+        areas[own] = np.maximum(areas[own], LEAST_AREA * (mean if mean > SMALLEST_AREA else UNKNOWN_AREA))
     return areas
+
+
+def _changes_size(nodes: Sequence[Node], index: int) -> bool:
+    """Return whether keyframes scale a node, or one above it, by factors that change."""
+    above: int | None = index
+    while above is not None:
+        if len({tuple(key.scale) for key in nodes[above].keyframes or ()}) > 1:
+            return True
+        above = nodes[above].parent
+    return False
 
 
 def light_power(light: PunctualLight, radius: float) -> float:

@@ -28,6 +28,14 @@ def geometry_hash(scene: SceneContents) -> str:
         _update(digest, triangles, flat.materials[triangles], flat.uvs[flat.indices[triangles]])
         if flat.colors is not None:
             _update(digest, flat.colors[flat.indices[triangles], 3])
+        second = np.array(
+            [
+                m.is_glass and m.transmission_texture is not None and m.transmission_texture.uv_set != 0
+                for m in scene.materials
+            ]
+        )[flat.materials]
+        if flat.further_uvs is not None and second.any():
+            _update(digest, flat.further_uvs[flat.indices[second]])
         for material in (m for m in scene.materials if m.lets_rays_pass):
             _update(digest, *textures.visibility_parts(material))
     for index, node in enumerate(scene.nodes):
@@ -56,8 +64,30 @@ def shape_hash(node: Node) -> str:
     return digest.hexdigest()
 
 
-def contents_hash(scene: SceneContents, geometry: str) -> str:
-    """Return the SHA-256 of all that decides the pictures, except cameras and sky, from that of the geometry."""
+class Hashes:
+    """Hashes of a scene. They are kept once it is on a device: until then its materials and lights may be edited."""
+
+    def __init__(self) -> None:
+        self._geometry: str | None = None
+        self._surfaces: hashlib._Hash | None = None
+
+    def geometry(self, scene: SceneContents) -> str:
+        """Return ``geometry_hash``."""
+        found = geometry_hash(scene) if self._geometry is None else self._geometry
+        if scene._devices:
+            self._geometry = found
+        return found
+
+    def contents(self, scene: SceneContents) -> str:
+        """Return the SHA-256 of all that decides the pictures, except cameras and sky. Lights are read anew."""
+        found = _surfaces(scene, self.geometry(scene)) if self._surfaces is None else self._surfaces
+        if scene._devices:
+            self._surfaces = found
+        return _with_lights(scene, found)
+
+
+def _surfaces(scene: SceneContents, geometry: str) -> hashlib._Hash:
+    """Return the digest of all that surfaces are, from the hash of the geometry."""
     digest = hashlib.sha256(b"warp_gi scene 1" + geometry.encode())
     flat = scene._flat
     _update(digest, flat.normals, flat.uvs, flat.materials, flat.objects)
@@ -67,6 +97,12 @@ def contents_hash(scene: SceneContents, geometry: str) -> str:
     for image in images:
         how = image.srgb, image.wrap, image.nearest, image.uv_set, image.transform
         _update(digest, repr(how), image.pixels)
+    return digest
+
+
+def _with_lights(scene: SceneContents, surfaces: hashlib._Hash) -> str:
+    """Return the SHA-256 of surfaces and of the lights as they are now."""
+    digest = surfaces.copy()
     world = animation.world_matrices(scene.nodes, 0.0)
     _update(digest, emitters.emitter_table(scene._emissive, scene.lights, world))
     _update(digest, repr([light.node for light in scene.lights]))

@@ -61,14 +61,37 @@ def alpha_masks(
             coverage = texture if by_alpha else None
             factor, cutoff = (material.alpha, material.alpha_cutoff) if by_alpha else (1.0, 0.0)
             masks.append((-1 if coverage is None else index_of[id(coverage)], factor, cutoff))
-    return AlphaMasks(face_mask, masks, flat.uvs, textures, texels, alphas, glass) if masks else None
+    uvs = _mask_uvs(flat, materials)
+    return AlphaMasks(face_mask, masks, uvs, textures, texels, alphas, glass) if masks else None
+
+
+def _mask_uvs(flat: FlatGeometry, materials: Sequence[Material]) -> np.ndarray:
+    """Return where masks and tints are looked up, float32 [vertex, 2]: at the base colour's coordinates.
+
+    Glass without a texture of its colour is looked up where its transmission is. Its vertices are nobody else's.
+    """
+    uvs = flat.uvs
+    for index, material in enumerate(materials):
+        share = material.transmission_texture
+        if share is None or not material.is_glass or material.base_color_texture is not None:
+            continue
+        if share.uv_set or share.transform is not None:
+            ids = np.unique(flat.indices[flat.materials == index])
+            uvs = uvs.copy() if uvs is flat.uvs else uvs
+            uvs[ids] = texture_coordinates(share, flat.uvs[ids], _of(flat.further_uvs, ids))
+    return uvs
+
+
+def _of(values: np.ndarray | None, ids: np.ndarray) -> np.ndarray | None:
+    return None if values is None else values[ids]
 
 
 def glass_tints(materials: Sequence[Material]) -> dict[int, Texture]:
     """Return, by the material's index, what textures leave of the light that goes through glass.
 
     It is the alpha of a texture at the base colour's coordinates, as large as the larger of the two that it is made of:
-    the luminance of the base colour over that of its factor, times the transmission.
+    the luminance of the base colour over that of its factor, times the transmission. Without a texture of the colour it
+    is that of the transmission, at its own coordinates.
     """
     found = {}
     for index, material in enumerate(materials):
@@ -82,7 +105,8 @@ def glass_tints(materials: Sequence[Material]) -> dict[int, Texture]:
             colors = linear_rgb(base).astype(np.float64) * np.asarray(material.base_color)
             left = _resampled(colors @ LUMINANCE / max(_brightest(material), 1e-12), base, height, width)
         if share is not None:
-            left = left * _resampled(share.pixels[..., 0] / 255.0, share, height, width)
+            place = share if base is not None else replace(share, transform=None)
+            left = left * _resampled(share.pixels[..., 0] / 255.0, place, height, width)
         pixels = np.zeros((height, width, 4), np.uint8)
         pixels[..., 3] = np.round(255.0 * np.clip(left, 0.0, 1.0))
         nearest = any(one.nearest for one in used)

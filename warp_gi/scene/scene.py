@@ -100,13 +100,12 @@ class Scene:
         if not np.isfinite(self._flat.points).all():
             raise SceneError(f"scene {self.name!r}: node transforms move vertices past the range of float32")
         times = np.linspace(0.0, self.duration, POSES_FOR_AREAS)
-        self._flat.mean_areas = emitters.mean_areas(self.nodes, self._flat, self._hulls, times)
+        self._flat.mean_areas = emitters.mean_areas(self.nodes, self._flat, self._moving, times)
         self._emissive, powers = emitters.emissive_triangles(self._flat, self.materials)
         self._light_grids = LightGrids(self._flat, self.materials, self._emissive, powers)
         self._bounds = self._all_bounds()
         self._devices: dict[str, DeviceScene] = {}
-        self._geometry_hash: str | None = None
-        self._contents_hash: str | None = None
+        self._hashes = hashing.Hashes()
         self._edits = Edits(self)
 
     # ---- what is in it ----
@@ -234,9 +233,7 @@ class Scene:
     @property
     def geometry_hash(self) -> str:
         """SHA-256 of all that decides visibility: triangles, alpha masks, animation."""
-        if self._geometry_hash is None:
-            self._geometry_hash = hashing.geometry_hash(self)
-        return self._geometry_hash
+        return self._hashes.geometry(self)
 
     @property
     def hash(self) -> str:
@@ -247,11 +244,10 @@ class Scene:
     def contents_hash(self) -> str:
         """SHA-256 of all that decides the pictures, except cameras and sky.
 
-        It is computed once: a sky that changes from frame to frame must not cost a pass over all textures.
+        It follows edits until the first frame. From then on only lights that frames read anew are hashed anew: a sky
+        that changes from frame to frame must not cost a pass over all textures.
         """
-        if self._contents_hash is None:
-            self._contents_hash = hashing.contents_hash(self, self.geometry_hash)
-        return self._contents_hash
+        return self._hashes.contents(self)
 
     # ---- what moves ----
 
@@ -305,11 +301,10 @@ class Scene:
         follow; None is ``time``, no motion. Nothing is done for a scene without keyframes,
         and the tree is refit only if a vertex moved. The sky is moved by ``update_sky``.
         """
-        if not self.is_animated:
-            return False
         with self.lock:
             self.data(device)
-            return self._devices[_device(device).alias].move(time, time if previous_time is None else previous_time)
+            previous = time if previous_time is None else previous_time
+            return self.is_animated and self._devices[_device(device).alias].move(time, previous)
 
     # ---- what kernels read ----
 

@@ -299,6 +299,6 @@ def texture_transform(document: Document, info: Part, what: str) -> tuple[int, n
 
 def _stands_elsewhere(texture: Texture | None, base: Texture | None) -> bool:
     """Return whether a texture has other coordinates, or repeats otherwise, than that of the base colour."""
-    if texture is None:
+    if texture is None or base is None:
         return False
-    return bool(texture.uv_set) or texture.transform is not None or (base is not None and texture.wrap != base.wrap)
+    return bool(texture.uv_set) or texture.transform is not None or texture.wrap != base.wrap

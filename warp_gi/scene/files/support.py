@@ -80,7 +80,11 @@ FEATURES: tuple[Feature, ...] = (
         "approximated",
         ("KHR_materials_pbrSpecularGlossiness", GLTF, "converted to metallic-roughness; pure Lambert without specular"),
         ("KHR_materials_unlit", GLTF, "emits its base colour, reflects nothing, and lights what is around it"),
-        ("coordinates of transmission textures", GLTF, "those of the base colour's texture, which it repeats like"),
+        (
+            "coordinates of transmission textures",
+            GLTF,
+            "where the base colour has a texture: its coordinates and wrapping",
+        ),
         ("a third set of texture coordinates", GLTF, "two sets for the textures of a material"),
         ("KHR_materials_variants", GLTF, "the materials without a variant"),
         (
