@@ -356,3 +356,12 @@ def timed(timings: dict[str, float], name: str, device: wp.Device) -> Iterator[N
     compiled = launch.compile_seconds - timings["compile"] - compiled
     timings["compile"] += compiled
     timings[name] = timings.get(name, 0.0) + time.perf_counter() - started - compiled - others
+
+
+def mixed_seed(seed: int, frame: int) -> int:
+    """Return a well-mixed 32-bit seed of a frame (splitmix64)."""
+    mask = (1 << 64) - 1
+    z = (seed * 0x9E3779B97F4A7C15 + frame * 0xD1B54A32D192ED03 + 0x9E3779B97F4A7C15) & mask
+    z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) & mask
+    z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & mask
+    return (z ^ (z >> 31)) & 0xFFFFFFFF

@@ -20,7 +20,7 @@ from warp_gi.denoise import Denoiser
 from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.estimator import Estimator
 from warp_gi.forecast import tell_cost
-from warp_gi.frame import Frame, timed
+from warp_gi.frame import Frame, mixed_seed, timed
 from warp_gi.kept import BakeFolder, cached_bake
 from warp_gi.kernels import compose, types
 from warp_gi.pipeline import DENOISER, Pipeline
@@ -28,6 +28,7 @@ from warp_gi.primary import CameraRays
 from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.camera import Camera, CameraPath, frame_time, warn_if_far
+from warp_gi.scene.device_scene import Trail
 from warp_gi.scene.scene import Scene
 from warp_gi.scene.sky_motion import sky_start
 from warp_gi.sequence.state import Dependence, state_arrays, with_arrays
@@ -113,6 +114,7 @@ class FrameScheduler:
         self._frames: int | None = None
         self._bake_seconds = 0.0
         self._baked_version = -1
+        self._trail: Trail | None = None
         self._sky_time = sky_start(self.scene.sky_at)
         self._scene_hash = ""
         self._frame_time: float | None = None
@@ -134,6 +136,7 @@ class FrameScheduler:
         if self._baked_version == self.scene.version:
             return
         started = time.perf_counter()
+        self._made.clear()
         launch.check_fork(self.device)
         self.scene.update(0.0, None, self.device)  # bakes and first states do not depend on who moved the scene before
         for place, part in self._parts.items():
@@ -244,7 +247,7 @@ class FrameScheduler:
             with frame.stage("denoise"):
                 frame.keep_noisy()
                 states[DENOISER] = denoiser.apply(frame, states[DENOISER])
-        self._states = states  # all or nothing
+        self._states, self._trail = states, self.scene.trail_of(index, self.device)  # all or nothing
         frame.finish()
         timings["scheduler"] = max(time.perf_counter() - began - sum(timings.values()), 0.0)
         timings["bake"] = self._bake_seconds
@@ -277,13 +280,14 @@ class FrameScheduler:
 
     def _new_frame(self, index: int, previous_index: int) -> Frame:
         now = frame_time(self.camera, index)
-        self.scene.update(now, frame_time(self.camera, previous_index), self.device)
+        follows = self._trail is not None and self._trail.index == previous_index != index
+        self.scene.update(now, frame_time(self.camera, previous_index), self.device, self._trail if follows else None)
         data = launch.copied(self.scene.data(self.device), types.SceneData)
         data.emitters, data.bvh = launch.copied(data.emitters, types.Emitters), launch.copied(data.bvh, types.Bvh)
         if self.scene.emitter_count:
             data.emitters.alias = whole_scene(self.scene).light_table(self.device)
         cameras = self._camera_at(index), self._camera_at(previous_index)
-        settings, seed = self.pipeline.frame_settings, _mix(self.seed, index)
+        settings, seed = self.pipeline.frame_settings, mixed_seed(self.seed, index)
         frame = Frame(self.scene, data, *cameras, settings, self.device, index, now, seed, previous_index)
         frame.estimators = dict(self.pipeline.estimators())
         frame.has_camera_rays = isinstance(self.pipeline.primary()[1], CameraRays)
@@ -388,12 +392,3 @@ def _bakes_by_class(bakes: Iterable[Bake], parts: dict[str, Stateful]) -> dict[s
             )
         found[one.technique].append(one)
     return found
-
-
-def _mix(seed: int, frame: int) -> int:
-    """Return a well-mixed 32-bit seed of a frame (splitmix64)."""
-    mask = (1 << 64) - 1
-    z = (seed * 0x9E3779B97F4A7C15 + frame * 0xD1B54A32D192ED03 + 0x9E3779B97F4A7C15) & mask
-    z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) & mask
-    z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & mask
-    return (z ^ (z >> 31)) & 0xFFFFFFFF

@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_gi import launch
 from warp_gi.kernels import denoise
+from warp_gi.scene.hashing import with_sky
 
 if TYPE_CHECKING:
     from warp_gi.frame import Frame
@@ -116,5 +117,8 @@ def _loaded(array: np.ndarray, dtype: type, count: int, device: wp.Device) -> wp
 
 
 def light_of(scene: Scene | BakedScene) -> str:
-    """Return a hash of a scene's light; of all but the sky where that changes over time, little by little."""
-    return scene.contents_hash if scene.is_sky_animated else scene.hash
+    """Return a hash of a scene's light; of all but the sky where that changes over time, little by little.
+
+    Nodes and points that edits move are left out, as those that keyframes move: motion vectors lead to where they were.
+    """
+    return scene.light_hash if scene.is_sky_animated else with_sky(scene.light_hash, scene.environment)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,7 @@ from warp_gi.scene.poses import deforms
 if TYPE_CHECKING:
     from warp_gi.scene.contents import SceneContents
     from warp_gi.scene.environment import Environment
-    from warp_gi.scene.model import Node
+    from warp_gi.scene.model import Node, Texture
 
 
 def geometry_hash(scene: SceneContents) -> str:
@@ -56,20 +57,71 @@ def shape_hash(node: Node) -> str:
     return digest.hexdigest()
 
 
-def contents_hash(scene: SceneContents, geometry: str) -> str:
-    """Return the SHA-256 of all that decides the pictures, except cameras and sky, from that of the geometry."""
-    digest = hashlib.sha256(b"warp_gi scene 1" + geometry.encode())
-    flat = scene._flat
-    _update(digest, flat.normals, flat.uvs, flat.materials, flat.objects)
-    _update(digest, *(part for part in (flat.colors, flat.further_uvs) if part is not None))
-    images = textures.distinct_textures(scene.materials)
-    _update(digest, textures.material_table(scene.materials, images))
-    for image in images:
-        how = image.srgb, image.wrap, image.nearest, image.uv_set, image.transform
-        _update(digest, repr(how), image.pixels)
-    world = animation.world_matrices(scene.nodes, 0.0)
-    _update(digest, emitters.emitter_table(scene._emissive, scene.lights, world))
-    _update(digest, repr([light.node for light in scene.lights]))
+class Digests:
+    """Hashes of a scene, each computed when it is asked for and kept until what it is of changes.
+
+    A colour in a loop, or a sky that changes from frame to frame, must not cost a pass over all textures.
+    """
+
+    def __init__(self, scene: SceneContents) -> None:
+        self._scene = scene
+        self._known: dict[str, str] = {}
+        self._light: str | None = None
+
+    def forget(self, *names: str) -> None:
+        """Compute some anew when they are asked for: "geometry", "normals", "surfaces", "images", "light".
+
+        That of all contents is computed anew too.
+        """
+        for name in (*names, "contents"):
+            self._known.pop(name, None)
+        if "light" in names:
+            self._light = None
+
+    def geometry(self) -> str:
+        """Return the hash of all that decides visibility."""
+        return self._once("geometry", lambda: geometry_hash(self._scene))
+
+    def contents(self) -> str:
+        """Return the hash of all that decides the pictures, except cameras and sky."""
+        return self._once("contents", self._contents)
+
+    def light(self) -> str:
+        """Return ``contents`` as it was before nodes and points were moved by edits."""
+        if self._light is None:
+            self._light = self.contents()
+        return self._light
+
+    def _once(self, name: str, compute: Callable[[], str]) -> str:
+        if name not in self._known:
+            self._known[name] = compute()
+        return self._known[name]
+
+    def _contents(self) -> str:
+        scene, flat = self._scene, self._scene._flat
+        images = textures.distinct_textures(scene.materials)
+        surfaces = [flat.uvs, flat.materials, flat.objects]
+        surfaces += [part for part in (flat.colors, flat.further_uvs) if part is not None]
+        parts = (
+            self._once("normals", lambda: _hash_of(flat.normals)),
+            self._once("surfaces", lambda: _hash_of(*surfaces)),
+            self._once("images", lambda: _hash_of(*(one for image in images for one in _image_parts(image)))),
+        )
+        digest = hashlib.sha256(b"warp_gi scene 2" + self.geometry().encode())
+        _update(digest, *parts, textures.material_table(scene.materials, images))
+        world = animation.world_matrices(scene.nodes, 0.0)
+        _update(digest, emitters.emitter_table(scene._emissive, scene.lights, world))
+        _update(digest, repr([light.node for light in scene.lights]))
+        return digest.hexdigest()
+
+
+def _image_parts(image: Texture) -> tuple[str, np.ndarray]:
+    return repr((image.srgb, image.wrap, image.nearest, image.uv_set, image.transform)), image.pixels
+
+
+def _hash_of(*parts: np.ndarray | str) -> str:
+    digest = hashlib.sha256()
+    _update(digest, *parts)
     return digest.hexdigest()
 
 
