@@ -147,7 +147,7 @@ class FrameScheduler:
 
     def _start_part(self, place: str, part: Stateful) -> None:
         """Start a part, unless all that it depends on is what it was."""
-        key = self._key_of(part)
+        key = part.state_key(self.scene) or self._key_of(part)
         if self._keys.get(place) != key:
             self._states[place], self._keys[place] = self._start(place, part), key
 

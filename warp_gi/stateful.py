@@ -103,6 +103,13 @@ class Stateful:
         """
         return ""
 
+    def state_key(self, scene: Scene | BakedScene) -> str:
+        """Return a hash of all in the scene that a state does not follow from frame to frame; "" is ``bake_key``.
+
+        When an edit changes it, the state is made anew before the next frame.
+        """
+        return ""
+
     def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Setting]:
         """Return the settings that a bake depends on."""
         return {}

@@ -22,7 +22,7 @@ from warp_gi.scene.poses import deforms, moving_nodes
 from warp_gi.scene.watching import Change, Watch
 
 if TYPE_CHECKING:
-    from warp_gi.scene.scene import Scene
+    from warp_gi.scene.contents import SceneContents
     from warp_gi.scene.sky_map import SkyMap
 
 NEW_SCENE = "make a new scene: gi.Scene(scene.nodes, scene.lights, scene.environment, scene.cameras)"
@@ -58,7 +58,7 @@ class _Slot(NamedTuple):
 class Edits:
     """The objects that a scene was made from. Made anew whenever the scene reads its nodes again."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: SceneContents) -> None:
         self.scene = scene
         self.slots = _slots(scene)
         self.material_count = len(scene.materials)
@@ -370,7 +370,7 @@ class Edits:
         return None
 
 
-def _slots(scene: Scene) -> list[list[_Slot]]:
+def _slots(scene: SceneContents) -> list[list[_Slot]]:
     """Return for each node where its meshes lie in the flat geometry."""
     rows = {id(material): row for row, material in enumerate(scene.materials)}
     vertex = triangle = 0

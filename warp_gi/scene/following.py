@@ -18,25 +18,25 @@ from warp_gi.scene.emission_grids import LightGrids
 from warp_gi.scene.model import Mesh, Node, Texture
 
 if TYPE_CHECKING:
-    from warp_gi.scene.scene import Scene
+    from warp_gi.scene.contents import SceneContents
 
 POSES_FOR_AREAS = 9
 """Number of evenly spaced poses over which areas of lamps that change their shape are averaged."""
 
 
-def lights_of(scene: Scene) -> tuple[np.ndarray, LightGrids]:
+def lights_of(scene: SceneContents) -> tuple[np.ndarray, LightGrids]:
     """Return which triangles of a scene emit, int64 [count], and how points on them are sampled."""
     triangles, powers = emitters.emissive_triangles(scene._flat, scene.materials)
     return triangles, LightGrids(scene._flat, scene.materials, triangles, powers)
 
 
-def set_areas(scene: Scene) -> None:
+def set_areas(scene: SceneContents) -> None:
     """Find the mean areas of lamps of a scene that change their shape."""
     times = np.linspace(0.0, scene.duration, POSES_FOR_AREAS)
     scene._flat.mean_areas = emitters.mean_areas(scene.nodes, scene._flat, scene._hulls, times)
 
 
-def reshape(scene: Scene, edited: Iterable[int]) -> None:
+def reshape(scene: SceneContents, edited: Iterable[int]) -> None:
     """Place what stands elsewhere since nodes were edited, and the meshes of nodes ``edited``, which have other points.
 
     Raises SceneError for what cannot be placed so, before anything changes.
@@ -82,7 +82,7 @@ def reshape(scene: Scene, edited: Iterable[int]) -> None:
     scene.version += 1
 
 
-def set_points(scene: Scene, target: Mesh | Node, points: ArrayLike, normals: ArrayLike | None) -> None:
+def set_points(scene: SceneContents, target: Mesh | Node, points: ArrayLike, normals: ArrayLike | None) -> None:
     """Give a mesh other points; see ``Scene.set_points``."""
     if isinstance(target, Node):
         if len(target.meshes) != 1:
@@ -112,7 +112,7 @@ def _numbers(values: ArrayLike, mesh: Mesh) -> np.ndarray:
         raise SceneError(f"mesh {mesh.name!r}: expected numbers [vertex, 3], got {values!r:.80}") from error
 
 
-def relight(scene: Scene) -> None:
+def relight(scene: SceneContents) -> None:
     """Take over edits of punctual lights, and of what materials emit.
 
     Raises SceneError for a light that is none, before anything changes.
@@ -126,7 +126,7 @@ def relight(scene: Scene) -> None:
     scene.version += 1
 
 
-def shade(scene: Scene, edited: Sequence[Texture], lets_rays_pass: bool) -> None:
+def shade(scene: SceneContents, edited: Sequence[Texture], lets_rays_pass: bool) -> None:
     """Take over edits of materials and of the textures ``edited``.
 
     ``lets_rays_pass`` says that a material which lets rays pass is among them, or did before.
@@ -137,7 +137,7 @@ def shade(scene: Scene, edited: Sequence[Texture], lets_rays_pass: bool) -> None
     scene.version += 1
 
 
-def _check(scene: Scene, edited: set[int]) -> None:
+def _check(scene: SceneContents, edited: set[int]) -> None:
     """Raise SceneError for nodes that cannot be placed, and meshes and skins that do not fit."""
     for index, node in enumerate(scene.nodes):
         geometry.check_placement(node, index)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -123,6 +123,33 @@ def _hash_of(*parts: np.ndarray | str) -> str:
     digest = hashlib.sha256()
     _update(digest, *parts)
     return digest.hexdigest()
+
+
+class Lit(Protocol):
+    """A scene, or what is left of one, as ``light_of`` sees it."""
+
+    @property
+    def light_hash(self) -> str:
+        """Hash of all but the sky, as it was before edits moved anything."""
+        ...
+
+    @property
+    def environment(self) -> Environment | None:
+        """The present sky."""
+        ...
+
+    @property
+    def is_sky_animated(self) -> bool:
+        """Whether the sky changes over time."""
+        ...
+
+
+def light_of(scene: Lit) -> str:
+    """Return a hash of a scene's light; of all but the sky where that changes over time, little by little.
+
+    Nodes and points that edits move are left out, as those that keyframes move: what is kept over frames follows them.
+    """
+    return scene.light_hash if scene.is_sky_animated else with_sky(scene.light_hash, scene.environment)
 
 
 def with_sky(contents: str, sky: Environment | None) -> str:
