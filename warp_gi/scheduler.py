@@ -119,6 +119,10 @@ class FrameScheduler:
         self._scene_hash = ""
         self._frame_time: float | None = None
 
+    def __repr__(self) -> str:
+        parts = ", ".join(f"{place} {type(part).__name__}" for place, part in self._parts.items())
+        return f"<FrameScheduler of scene {self.scene.name!r} on {self.device}, seed {self.seed}: {parts}>"
+
     # ---- before the first frame ----
 
     @_holds_scene

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from warp_gi.plain import take_plain
 from warp_gi.scene.camera import views_hash
 
 if TYPE_CHECKING:
@@ -52,6 +53,8 @@ _EARLIER = {
 class Stateful:
     """Base of estimators, services, radiance caches, primaries and denoisers; a frozen dataclass of plain settings.
 
+    Numbers of NumPy's kinds become Python's own.
+
     The scheduler calls ``bake`` and ``start`` before the first frame, with the scene at time 0, whoever moved it
     before. For each frame it calls ``preprocess`` before rays are traced and ``after`` when the frame's sums are
     complete. Each returns a state and leaves the one that it was given as it is, arrays included: a frame that is
@@ -67,6 +70,7 @@ class Stateful:
                 raise TypeError(f"{cls.__name__}.{name} is of an earlier version and never called: {instead}")
 
     def __post_init__(self) -> None:
+        take_plain(self)
         self.validate()
 
     def validate(self) -> None:
