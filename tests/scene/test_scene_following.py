@@ -10,7 +10,7 @@ import pytest
 from scene_tools import triangle
 
 import warp_gi as gi
-from warp_gi.errors import BakeError, SceneError
+from warp_gi.errors import BakeError, OptionError, SceneError
 from warp_gi.scene.model import Keyframe, Material, Mesh, MorphKeyframe, MorphTarget, Node, PunctualLight, Skin, Texture
 
 SIZE = (16, 12)
@@ -159,6 +159,16 @@ def test_what_bends_follows():
         assert_same_picture(frame, scene, DIRECT, ("beauty", "position", "normal"))
         assert not np.array_equal(frame.numpy("position"), pictures[-1])
         pictures.append(frame.numpy("position"))
+
+
+def test_a_node_is_found_by_its_name():
+    scene = robot()
+    assert scene.node("elbow") is scene.nodes[2]
+    with pytest.raises(OptionError, match="unknown node 'elbows'; did you mean 'elbow'"):
+        scene.node("elbows")
+    scene.nodes[1].name = "elbow"
+    with pytest.raises(SceneError, match="2 nodes are named 'elbow'; give the one that is meant a name of its own"):
+        scene.node("elbow")
 
 
 # ---- what lets rays pass ----
@@ -431,7 +441,7 @@ def test_what_a_bake_leaves_free_follows_at_once():
 # ---- an interrupt ----
 
 
-@pytest.mark.parametrize("where", ["geometry.place", "emitters.emissive_triangles", "Watch"])
+@pytest.mark.parametrize("where", ["geometry.write", "emitters.emissive_triangles", "Watch"])
 def test_an_interrupted_edit_is_taken_over_by_the_next_frame(where, monkeypatch):
     from warp_gi.scene import edits, following
 

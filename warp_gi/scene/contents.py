@@ -54,10 +54,6 @@ class SceneContents(Protocol):
         """Hashes of what the scene holds."""
         ...
 
-    def _all_bounds(self) -> np.ndarray:
-        """Return the lowest and highest corner in metres, float32 [2, 3], as the scene is now."""
-        ...
-
     @property
     def _devices(self) -> Mapping[str, Any]:
         """Buffers on each device (``DeviceScene``), by the device's alias."""

@@ -221,22 +221,27 @@ class DeviceScene:
 
     # ---- what moves ----
 
-    def remember(self, indices: Iterable[int]) -> None:
-        """Keep for motion vectors where vertices of nodes are whose meshes get other points; they are placed anew."""
-        now, before = list(self.poses), list(self.previous_poses)
+    def remember(self, indices: Iterable[int]) -> Trail:
+        """Return where everything is before an edit, for ``settle``.
+
+        Meshes of the nodes ``indices`` get other points: they are placed anew, and all trails keep the old ones.
+        """
+        before = Trail(-1, self.poses)
+        now, previous = list(self.poses), list(self.previous_poses)
         for index in indices:
             start, stop = self.flat.vertex_starts[index : index + 2]
+            before.points[index] = self.flat.points[start:stop].copy()
             for trail in self.trails:
-                if index not in trail.points:
-                    trail.points[index] = self.flat.points[start:stop].copy()
-            now[index] = before[index] = UNKNOWN
-        self.poses, self.previous_poses = now, before
+                trail.points.setdefault(index, before.points[index])
+            now[index] = previous[index] = UNKNOWN
+        self.poses, self.previous_poses = now, previous
+        return before
 
-    def settle(self) -> None:
-        """Take over nodes and points of the scene at the time of the last ``move``."""
+    def settle(self, before: Trail) -> None:
+        """Take over nodes and points of the scene at the time of the last ``move``, as they are after an edit."""
         self._static_bvh = None
         self.reframe()
-        self.move(self.time, self.time)
+        self.move(self.time, self.time, before)
 
     def trail(self, index: int) -> Trail:
         """Return where the frame ``index`` sees the scene, in the pose that it is in: that of its last ``move``."""
@@ -273,7 +278,11 @@ class DeviceScene:
                 self._upload(target.previous_points, self.previous_points, start, stop)
                 changed = True
             if not _alike(now[index], was[index]):
-                geometry.place(flat, node, now[index], start)
+                if now[index] is scene._poses[index] and self.is_parted:
+                    flat.points[start:stop] = scene._flat.points[start:stop]
+                    flat.normals[start:stop] = scene._flat.normals[start:stop]
+                else:
+                    geometry.place(flat, node, now[index], start)
                 self._upload(target.points, flat.points, start, stop)
                 self._upload(target.normals, flat.normals, start, stop)
                 moved = True

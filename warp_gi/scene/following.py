@@ -13,15 +13,32 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warp_gi.errors import SceneError
-from warp_gi.scene import emitters, geometry, hulls, poses
+from warp_gi.scene import animation, emitters, geometry, hulls, poses
 from warp_gi.scene.emission_grids import LightGrids
 from warp_gi.scene.model import Mesh, Node, Texture
 
 if TYPE_CHECKING:
     from warp_gi.scene.contents import SceneContents
 
+POSES_FOR_BOUNDS = 33
+"""Number of evenly spaced poses, beside those of the keyframes, that the bounds of an animated scene enclose."""
 POSES_FOR_AREAS = 9
 """Number of evenly spaced poses over which areas of lamps that change their shape are averaged."""
+
+
+def bounds_of(scene: SceneContents) -> np.ndarray:
+    """Return the lowest and highest corner in metres, float32 [2, 3]; of an animated scene over all of its time."""
+    flat = scene._flat
+    points = flat.points[np.unique(flat.indices)] if len(flat.points) > 3 * len(flat.indices) else flat.points
+    boxes = [np.stack([points.min(axis=0), points.max(axis=0)])]
+    if scene.is_animated:
+        evenly = np.linspace(0.0, scene.duration, POSES_FOR_BOUNDS)
+        for swept in (
+            animation.swept_box(scene.nodes, scene._moving, evenly),
+            hulls.swept_box(scene.nodes, scene._hulls, evenly),
+        ):
+            boxes += [swept] if np.isfinite(swept).all() else []
+    return np.stack([np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))]).astype(np.float32)
 
 
 def lights_of(scene: SceneContents) -> tuple[np.ndarray, LightGrids]:
@@ -53,30 +70,32 @@ def reshape(scene: SceneContents, edited: Iterable[int]) -> None:
         for index, node in enumerate(nodes)
         if node.meshes and (index in edited or placed[index] is not old[index])
     ]
+    pieces = {}
     for index in changed:
         node, pose = nodes[index], placed[index]
         for mesh in node.meshes:
             if pose.mirrors(mesh) != old[index].mirrors(mesh):
                 raise SceneError(f"scene {scene.name!r}: node {node.name!r} was mirrored; make a new scene for that")
-        if node.meshes and not np.isfinite(geometry.placed_points(node, pose)).all():
+        pieces[index] = [pose.vertices(mesh) for mesh in node.meshes]
+        if not all(np.isfinite(points).all() for points, _ in pieces[index]):
             raise SceneError(f"scene {scene.name!r}: node {node.name!r} moves vertices past the range of float32")
     devices = list(scene._devices.values())
     for device in devices:
         device.part()
-        device.remember(edited)
+    before = [device.remember(edited) for device in devices]
     for index in changed:
-        geometry.place(scene._flat, nodes[index], placed[index], scene._flat.vertex_starts[index])
+        geometry.write(scene._flat, pieces[index], scene._flat.vertex_starts[index])
     scene._poses = placed
     if scene._hulls and edited:
         scene._hulls = hulls.hulls_of(nodes, scene._moving)
         set_areas(scene)
     is_lit = any(max(mesh.material.emission) > 0.0 for index in changed for mesh in nodes[index].meshes)
-    scene._bounds = scene._all_bounds()
+    scene._bounds = bounds_of(scene)
     scene._digests.forget("geometry", "normals")
     if is_lit:
         scene._emissive, scene._light_grids = lights_of(scene)
-    for device in devices:
-        device.settle()
+    for device, trail in zip(devices, before, strict=True):
+        device.settle(trail)
         if is_lit:
             device.relight()
     scene.version += 1

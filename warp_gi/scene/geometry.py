@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -182,9 +182,13 @@ def _finite_uvs(uvs: np.ndarray) -> np.ndarray:
 
 def place(flat: FlatGeometry, node: Node, pose: Pose, vertex: int) -> None:
     """Write points and normals of ``node``'s meshes in a pose from ``vertex`` on."""
-    for mesh in node.meshes:
-        end = vertex + len(mesh.points)
-        points, normals = pose.vertices(mesh)
+    write(flat, (pose.vertices(mesh) for mesh in node.meshes), vertex)
+
+
+def write(flat: FlatGeometry, pieces: Iterable[tuple[np.ndarray, np.ndarray | None]], vertex: int) -> None:
+    """Write points and normals of meshes, one after another, from ``vertex`` on; no normals are flat shading."""
+    for points, normals in pieces:
+        end = vertex + len(points)
         flat.points[vertex:end] = points
         flat.normals[vertex:end] = 0.0 if normals is None else normals
         vertex = end

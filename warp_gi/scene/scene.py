@@ -26,9 +26,6 @@ if TYPE_CHECKING:
     from warp_gi.scene.environment import Environment, Sky
     from warp_gi.scene.pinhole import Camera
 
-POSES_FOR_BOUNDS = 33
-"""Number of evenly spaced poses, beside those of the keyframes, that the bounds of an animated scene enclose."""
-
 
 class Scene:
     """A scene: everything that is rendered. Lengths in metres, y up, colours linear Rec. 709.
@@ -98,7 +95,7 @@ class Scene:
             raise SceneError(f"scene {self.name!r}: node transforms move vertices past the range of float32")
         following.set_areas(self)
         self._emissive, self._light_grids = following.lights_of(self)
-        self._bounds = self._all_bounds()
+        self._bounds = following.bounds_of(self)
         self._devices: dict[str, DeviceScene] = {}
         self._digests = hashing.Digests(self)
         self._edits = Edits(self)
@@ -247,20 +244,28 @@ class Scene:
 
     # ---- what moves ----
 
+    def node(self, name: str) -> Node:
+        """Return the node of a name, whose fields may be edited between frames.
+
+        Raises SceneError if several nodes have the name, OptionError if none has.
+        """
+        matches = [candidate for candidate in self.nodes if candidate.name == name]
+        if not matches:
+            raise unknown_name("node", name, {candidate.name for candidate in self.nodes})
+        if len(matches) > 1:
+            raise SceneError(f"{len(matches)} nodes are named {name!r}; give the one that is meant a name of its own")
+        return matches[0]
+
     def animate(self, node: str, keyframes: Sequence[Keyframe]) -> None:
         """Replace the pose of a node (in its parent's space) by keyframes; bakes and device buffers start afresh.
 
         Raises SceneError for bad keyframes or if several nodes have the name, OptionError if none has.
         """
-        matches = [index for index, candidate in enumerate(self.nodes) if candidate.name == node]
-        if not matches:
-            raise unknown_name("node", node, {candidate.name for candidate in self.nodes})
-        if len(matches) > 1:
-            raise SceneError(f"{len(matches)} nodes are named {node!r}; give the one to animate a name of its own")
+        target = self.node(node)
         animation.check_keyframes(keyframes, node)
         geometry.check_nodes(self.nodes)  # they are read anew, with every edit so far
         with self.lock:
-            animation.set_keyframes(self.nodes[matches[0]], keyframes, self.offset)
+            animation.set_keyframes(target, keyframes, self.offset)
             self._flatten()
 
     def set_points(self, mesh: Mesh | Node, points: ArrayLike, normals: ArrayLike | None = None) -> None:
@@ -374,19 +379,6 @@ class Scene:
         with self.lock:
             self.data(device)
             return self._devices[_device(device).alias].static_bvh()
-
-    def _all_bounds(self) -> np.ndarray:
-        flat = self._flat
-        used = np.unique(flat.indices) if len(flat.points) > 3 * len(flat.indices) else slice(None)
-        boxes = [np.stack([flat.points[used].min(axis=0), flat.points[used].max(axis=0)])]
-        if self.is_animated:
-            evenly = np.linspace(0.0, self.duration, POSES_FOR_BOUNDS)
-            for swept in (
-                animation.swept_box(self.nodes, self._moving, evenly),
-                hulls.swept_box(self.nodes, self._hulls, evenly),
-            ):
-                boxes += [swept] if np.isfinite(swept).all() else []
-        return np.stack([np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))]).astype(np.float32)
 
 
 def _device(device: str | wp.Device | None) -> wp.Device:
