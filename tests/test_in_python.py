@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import io
 import logging
 import pickle
+import re
 import subprocess
 import sys
 
@@ -17,6 +19,7 @@ from PIL import Image
 import warp_gi as gi
 from warp_gi import launch
 from warp_gi.errors import OptionError
+from warp_gi.stateful import Stateful
 
 COPIES = {"pickle": lambda thing: pickle.loads(pickle.dumps(thing)), "deepcopy": copy.deepcopy}
 SIZE = (24, 16)
@@ -120,6 +123,64 @@ def test_things_say_what_they_are():
     assert "TracedEnvironment" in repr(gi.Pipeline())
 
 
+def test_parts_of_scenes_say_what_they_are_in_one_line():
+    """Arrays by their sizes alone."""
+    node = leaf().nodes[0]
+    mesh = "<Mesh 'mesh': 4 vertices, 2 triangles, material 'leaf', uvs>"
+    assert repr(node.meshes[0]) == mesh
+    assert repr(node) == f"<Node 'leaf': at (0, 0, 0) m, 2 keyframes, {mesh}>"
+    assert repr(gi.Node("b", parent=3)) == "<Node 'b': at (0, 0, 0) m, below node 3>"
+    assert repr(node.meshes[0].material.base_color_texture) == "<Texture 'leaf': 4 x 4 pixels, sRGB>"
+    sky = gi.Environment(pixels=np.ones((2, 4, 3), np.float32), rotation=30.0)
+    assert repr(sky) == "<Environment 'environment': 4 x 2 pixels, rotation 30, scale 1>"
+    assert "color (1.0, 0.5, 0.2)" in repr(leaf().environment)
+    scheduler = gi.FrameScheduler(leaf(), camera(), gi.Pipeline(indirect=None), seed=3)
+    assert repr(scheduler).startswith("<FrameScheduler of scene 'leaves' on cpu, seed 3: environment TracedEnvironment")
+
+
+class Line(io.StringIO):
+    """A stream that may be a terminal."""
+
+    def __init__(self, is_terminal: bool) -> None:
+        super().__init__()
+        self.isatty = lambda: is_terminal
+
+
+def test_a_line_shows_progress(monkeypatch):
+    """On a terminal and in a notebook, and ends with the frames; nothing is written to a file."""
+    shell = type("ZMQInteractiveShell", (), {})()
+    notebook = type(sys)("IPython")
+    notebook.get_ipython = lambda: shell
+    for is_terminal, is_notebook in ((True, False), (False, True), (False, False)):
+        stream = Line(is_terminal)
+        monkeypatch.setattr(sys, "stderr", stream)
+        if is_notebook:
+            monkeypatch.setitem(sys.modules, "IPython", notebook)
+        else:
+            monkeypatch.delitem(sys.modules, "IPython", raising=False)
+        path = gi.CameraPath.from_cameras([camera()] * 2)
+        frames = gi.render(leaf(), path, gi.Pipeline(spp=1), progress=True)
+        next(frames)
+        assert "\n" not in stream.getvalue()
+        assert len(list(frames)) == 1
+        said = stream.getvalue()
+        if not (is_terminal or is_notebook):
+            assert said == ""
+            continue
+        assert said.startswith("\r[") and said.endswith("\n") and said.count("\n") == 1
+        last = said.rstrip("\n").rpartition("\r")[2].rstrip()
+        assert last == f"[{'#' * 30}] 2/2 frames  trace 100 %" and f"\r[{'#' * 15}{' ' * 15}] 1/2 frames" in said
+
+
+def test_a_bake_shows_its_progress(monkeypatch):
+    stream = Line(True)
+    monkeypatch.setattr(sys, "stderr", stream)
+    gi.bake(gi.builtin_scene("cornell_box"), gi.SurfaceCache(paths=1000), camera=camera(), progress=True)
+    assert re.fullmatch(r"(\r\[#* *\]  bake \d+ % *)+\n", stream.getvalue())
+    with pytest.raises(OptionError, match=r"progress must be True, or be called with \(stage, share done\), got 'yes'"):
+        next(gi.render(leaf(), camera(), gi.Pipeline(spp=1), progress="yes"))
+
+
 def test_equal_cameras_compare_equal():
     assert camera() == camera() and hash(camera()) == hash(camera())
     named = gi.Camera.look_at((0, 1, 3.4), (0, 1, 0), resolution=SIZE, name="main")
@@ -147,6 +208,41 @@ def test_whole_numbers_of_numpy():
         np.testing.assert_array_equal(one.numpy("beauty"), other.numpy("beauty"))
         assert one.metadata == other.metadata
     assert repr(pipeline) == repr(gi.Pipeline(spp=2, camera_samples=2))
+
+
+def settings_of_numpy():
+    """Yield a class, a field, and a value of NumPy's kinds with that which it stands for."""
+    for name in gi.__all__:
+        kind = getattr(gi, name)
+        if not (isinstance(kind, type) and (issubclass(kind, Stateful) or kind is gi.Pipeline)):
+            continue
+        for one in dataclasses.fields(kind):
+            value = one.default
+            if isinstance(value, bool):
+                yield kind, one.name, np.bool_(value), value
+            elif isinstance(value, int):
+                yield kind, one.name, np.int64(value), value
+                yield kind, one.name, np.array(value), value
+            elif isinstance(value, float):
+                yield kind, one.name, np.float64(value), value
+                yield kind, one.name, np.float32(value), float(np.float32(value))
+            elif isinstance(value, tuple) and value:
+                yield kind, one.name, np.array(value), value
+                yield kind, one.name, tuple(np.array(value)), value
+
+
+def test_every_setting_takes_numbers_of_numpy():
+    found = list(settings_of_numpy())
+    assert len(found) > 100 and {gi.Pipeline, gi.RadianceTransfer, gi.SpatioTemporal} <= {kind for kind, *_ in found}
+    for kind, name, given, plain in found:
+        ours, truth = (kind(**{name: value}) for value in (given, plain))
+        assert repr(ours) == repr(truth) and ours == truth, (kind, name)
+        assert type(getattr(ours, name)) is type(plain), (kind, name)
+    assert gi.Pipeline(spp=np.uint8(3), background=np.bool_(False)) == gi.Pipeline(spp=3, background=False)
+    with pytest.raises(OptionError, match="spp must be a whole number, got True"):
+        gi.Pipeline(spp=np.bool_(True))
+    with pytest.raises(OptionError, match=r"paths must be a whole number .* got 2000.5"):
+        gi.SurfaceCache(paths=np.float64(2000.5))
 
 
 def test_a_bake_by_numbers_of_numpy_is_the_same(tmp_path):

@@ -135,6 +135,17 @@ class TriangleBvh:
             return self.data.nodes.capacity + self.data.blocks.capacity + self.data.parents.capacity
         return 3 * 32 * self.triangle_count  # wp.Mesh: two binary nodes and the bounds of each triangle
 
+    def set_alpha(self, alpha: AlphaMasks | None) -> None:
+        """Replace the triangles with holes; None is none. Raises SceneError for masks that do not fit the triangles."""
+        self._alpha = alpha
+        empty = types.Bvh()
+        for name in ("face_masks", "masks", "points", "uvs", "alphas", "indices", "textures", "texels", "chance"):
+            setattr(self.data, name, getattr(empty, name))
+        if alpha is not None:
+            self._set_alpha(alpha)
+        if self.device.is_cpu:
+            self._fill()
+
     def refit(self, points: object) -> None:
         """Move the vertices; same shape and triangles. Queries slow down as motion departs from the built pose."""
         positions = _checked_points(points)

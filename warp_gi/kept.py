@@ -14,7 +14,7 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,7 +25,9 @@ import warp as wp
 import warp_gi.kernels
 from warp_gi.baking import Bake, load_bake
 from warp_gi.errors import BakeError, one_line
+from warp_gi.estimator import Estimator
 from warp_gi.files import cache_folder, prune, remove_stale_parts, user_path
+from warp_gi.radiance_cache import RadianceCache
 
 if TYPE_CHECKING:
     from warp_gi.scene.baked import BakedScene
@@ -161,3 +163,18 @@ def code_hash() -> str:
             digest.update(f"{path.name} {path.stat().st_size}".encode())
             digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def bakes_by_class(bakes: Iterable[Bake], parts: dict[str, Stateful]) -> dict[str, list[Bake]]:
+    """Return the bakes by the class that they are for; raises BakeError for one that nothing uses."""
+    users = [part for part in parts.values() if isinstance(part, Estimator | RadianceCache)]
+    found: dict[str, list[Bake]] = {type(part).__name__: [] for part in users}
+    for one in bakes:
+        if one.technique not in found:
+            names = ", ".join(sorted(found)) or "none"
+            raise BakeError(
+                f"a bake of {one.technique} was given, but the pipeline's estimators are: {names}; leave it out, "
+                "or name another pipeline"
+            )
+        found[one.technique].append(one)
+    return found

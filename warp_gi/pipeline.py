@@ -12,6 +12,7 @@ from warp_gi.denoise import DENOISERS, Denoiser, denoiser_named
 from warp_gi.errors import OptionError, unknown_name, whole_number
 from warp_gi.estimator import Estimator
 from warp_gi.frame import TERMS, FrameSettings
+from warp_gi.plain import take_plain
 from warp_gi.primary import CameraRays, Primary
 from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import BakedScene
@@ -67,6 +68,7 @@ class Pipeline:
     """Octree of regions shared by the techniques that learn (``VisibilityLightCache``, ``GuidedPaths``)."""
 
     def __post_init__(self) -> None:
+        take_plain(self)
         for name in ("spp", "camera_samples"):
             if (count := getattr(self, name)) is not None:
                 object.__setattr__(self, name, whole_number(name, count))

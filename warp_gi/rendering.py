@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
@@ -15,6 +15,7 @@ from warp_gi.estimator import Estimator
 from warp_gi.foretold import kernels_of
 from warp_gi.kept import BakeFolder, cached_bake
 from warp_gi.pipeline import DEFAULT, Pipeline
+from warp_gi.progress import Progress, shown
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.sky_motion import sky_start
 from warp_gi.scheduler import FrameScheduler
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
     from warp_gi.frame import Frame
     from warp_gi.scene.scene import Scene
 
-Progress = Callable[[str, float], None]
-
 
 def render(
     scene: Scene | Bake,
@@ -38,7 +37,7 @@ def render(
     device: str = "cpu",
     seed: int = 0,
     skip: Container[int] = (),
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     bakes: Iterable[Bake] = (),
     *,
     output: str | Path | None = None,
@@ -71,7 +70,7 @@ def render(
         seed: Every random number follows from it, the frame, the pixel and the sample.
         skip: Frames that need not be rendered, because they exist already. What depends on frames before
             (``FrameScheduler.dependence``) does not see them.
-        progress: Called with (stage, share done in [0, 1]).
+        progress: Called with (stage, share done in [0, 1]); True shows a line on stderr, in a notebook too.
         bakes: Bakes made before (``gi.bake``, ``gi.load_bake``), each for the estimator that it names.
         output: Where frames go, as "out/shot.####.exr": #### becomes the frame's number. EXR files have every buffer
             as a named layer, and metadata; PNG files are tone-mapped pictures, and cannot be resumed. None writes none.
@@ -109,40 +108,41 @@ def render(
     if frame_time is not None:
         check_seconds(frame_time)
     wanted = _frame_numbers(camera, frames)
-    scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, progress, bakes, cache)
-    camera = scheduler.camera
-    launch.load_ahead(kernels_of(scheduler.pipeline, scheduler.scene), scheduler.device)
-    if output is None:
-        if frame_time is not None and wanted:
-            scheduler.take_samples(
-                samples_within(scheduler, shots_of(camera, list(dict.fromkeys(wanted)), "#.exr"), frame_time),
-                frame_time,
-            )
-        for position, index in enumerate(wanted):
-            if index not in skip:
-                yield scheduler.frame(index, wanted[position - 1] if position else None)
-        return
-    files = Output(Path(output), precision, preview, exposure)
-    shots = [shot for shot in shots_of(camera, wanted, files.pattern) if shot.index not in skip]
-    if not shots:
-        return
-    run = run_of(scheduler, shots, files, part)
-    if frame_time is not None:
-        take_time(run, frame_time, resume)
-    plan = run.plan(resume)
-    try:
-        run.prepare(plan)
-        if cluster is not None:
-            yield from _on_cluster(cluster, run, plan, SceneAsItIs(scene), bakes, cache, resume)
+    with shown(progress, len(wanted)) as told:
+        scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, told, bakes, cache)
+        camera = scheduler.camera
+        launch.load_ahead(kernels_of(scheduler.pipeline, scheduler.scene), scheduler.device)
+        if output is None:
+            if frame_time is not None and wanted:
+                scheduler.take_samples(
+                    samples_within(scheduler, shots_of(camera, list(dict.fromkeys(wanted)), "#.exr"), frame_time),
+                    frame_time,
+                )
+            for position, index in enumerate(wanted):
+                if index not in skip:
+                    yield scheduler.frame(index, wanted[position - 1] if position else None)
             return
-        run.lead()
-        for shot in plan.todo:
-            frame = run.render(shot)
-            run.save_state(shot, frame)
-            yield frame
-            del frame  # before there is a next one
-    finally:
-        run.finish()
+        files = Output(Path(output), precision, preview, exposure)
+        shots = [shot for shot in shots_of(camera, wanted, files.pattern) if shot.index not in skip]
+        if not shots:
+            return
+        run = run_of(scheduler, shots, files, part)
+        if frame_time is not None:
+            take_time(run, frame_time, resume)
+        plan = run.plan(resume)
+        try:
+            run.prepare(plan)
+            if cluster is not None:
+                yield from _on_cluster(cluster, run, plan, SceneAsItIs(scene), bakes, cache, resume)
+                return
+            run.lead()
+            for shot in plan.todo:
+                frame = run.render(shot)
+                run.save_state(shot, frame)
+                yield frame
+                del frame  # before there is a next one
+        finally:
+            run.finish()
 
 
 def _on_cluster(
@@ -165,7 +165,7 @@ def plan_sequence(
     frames: Iterable[int] | None = None,
     device: str = "cpu",
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     bakes: Iterable[Bake] = (),
     *,
     output: str | Path,
@@ -184,15 +184,16 @@ def plan_sequence(
     """
     part = chunk_of(chunk, warm_up, frame_time)
     wanted = _frame_numbers(camera, frames)
-    scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, progress, bakes, cache)
-    files = Output(Path(output), precision)
-    shots = shots_of(scheduler.camera, wanted, files.pattern)
-    if not shots:
-        return Plan((), ())
-    run = run_of(scheduler, shots, files, part)
-    if frame_time is not None:
-        take_time(run, frame_time, resume=True)
-    return run.plan()
+    with shown(progress) as told:
+        scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, told, bakes, cache)
+        files = Output(Path(output), precision)
+        shots = shots_of(scheduler.camera, wanted, files.pattern)
+        if not shots:
+            return Plan((), ())
+        run = run_of(scheduler, shots, files, part)
+        if frame_time is not None:
+            take_time(run, frame_time, resume=True)
+        return run.plan()
 
 
 def bake(
@@ -201,7 +202,7 @@ def bake(
     device: str = "cpu",
     seed: int = 0,
     camera: Camera | CameraPath | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     *,
     camera_path: Camera | CameraPath | None = None,
     cache: BakeFolder | str | Path | None = None,
@@ -215,7 +216,7 @@ def bake(
         device: "cpu", "cuda", "cuda:1".
         seed: Every random number follows from it.
         camera: Where the scene will be seen from, for estimators that bake no more than that; None is everywhere.
-        progress: Called with (stage, share done in [0, 1]).
+        progress: Called with (stage, share done in [0, 1]); True shows a line on stderr, in a notebook too.
         camera_path: Another name of ``camera``.
         cache: Folder in which bakes that take long are kept, and found the next time; None keeps none.
 
@@ -227,12 +228,11 @@ def bake(
     camera = camera_path if camera is None else camera
     if camera is not None:
         camera = camera.relative_to(scene.offset)
-    told = (lambda share: progress("bake", share)) if progress else None
 
     def make() -> Bake | None:
-        return estimator.bake(scene, device, seed, told, camera)
+        return estimator.bake(scene, device, seed, told and (lambda share: told("bake", share)), camera)
 
-    with scene.lock:
+    with shown(progress) as told, scene.lock:
         scene.check_unchanged()
         scene.update_sky(sky_start(scene.sky_at))
         scene.update(0.0, None, device)

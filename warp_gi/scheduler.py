@@ -18,17 +18,16 @@ from warp_gi import launch
 from warp_gi.baking import Bake, Setting, load_bake
 from warp_gi.denoise import Denoiser
 from warp_gi.errors import BakeError, OptionError, unknown_name
-from warp_gi.estimator import Estimator
 from warp_gi.forecast import tell_cost
 from warp_gi.frame import Frame, mixed_seed, timed
-from warp_gi.kept import BakeFolder, cached_bake
+from warp_gi.kept import BakeFolder, bakes_by_class, cached_bake
 from warp_gi.kernels import compose, types
 from warp_gi.memory import check_picture
 from warp_gi.pipeline import DENOISER, Pipeline
 from warp_gi.primary import CameraRays
-from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.scene.camera import Camera, CameraPath, frame_time, warn_if_far
+from warp_gi.scene.device_scene import Trail
 from warp_gi.scene.scene import Scene
 from warp_gi.scene.sky_motion import sky_start
 from warp_gi.sequence.state import Dependence, state_arrays, with_arrays
@@ -104,7 +103,7 @@ class FrameScheduler:
         check_picture(self.camera.resolution, self.pipeline.denoise is not None, self.device)
         self._progress = progress or (lambda stage, share: None)
         self._parts = self.pipeline.parts()
-        self._bakes = _bakes_by_class(bakes, self._parts)
+        self._bakes = bakes_by_class(bakes, self._parts)
         self._bake_digests: dict[str, str] = {}
         self._cache = cache
         self._made: dict[tuple[str, str, str], Bake] = {}
@@ -114,6 +113,7 @@ class FrameScheduler:
             self._start_part(DENOISER, self.pipeline.denoise)
         self._frames: int | None = None
         self._bake_seconds, self._baked_version = 0.0, -1
+        self._trail: Trail | None = None
         self._sky_time = sky_start(self.scene.sky_at)
         self._scene_hash = ""
         self._frame_time: float | None = None
@@ -125,6 +125,10 @@ class FrameScheduler:
         for name in ("_states", "_keys", "_bake_digests", "_made"):
             setattr(other, name, dict(getattr(self, name)))
         return other
+
+    def __repr__(self) -> str:
+        parts = ", ".join(f"{place} {type(part).__name__}" for place, part in self._parts.items())
+        return f"<FrameScheduler of scene {self.scene.name!r} on {self.device}, seed {self.seed}: {parts}>"
 
     # ---- before the first frame ----
 
@@ -143,6 +147,7 @@ class FrameScheduler:
         if self._baked_version == self.scene.version:
             return
         started = time.perf_counter()
+        self._made.clear()
         launch.check_fork(self.device)
         self.scene.update(0.0, None, self.device)  # bakes and first states do not depend on who moved the scene before
         for place, part in self._parts.items():
@@ -153,7 +158,7 @@ class FrameScheduler:
 
     def _start_part(self, place: str, part: Stateful) -> None:
         """Start a part, unless all that it depends on is what it was."""
-        key = self._key_of(part)
+        key = part.state_key(self.scene) or self._key_of(part)
         if self._keys.get(place) != key:
             self._states[place], self._keys[place] = self._start(place, part), key
 
@@ -253,7 +258,7 @@ class FrameScheduler:
             with frame.stage("denoise"):
                 frame.keep_noisy()
                 states[DENOISER] = denoiser.apply(frame, states[DENOISER])
-        self._states = states  # all or nothing
+        self._states, self._trail = states, self.scene.trail_of(index, self.device)  # all or nothing
         frame.finish()
         timings["scheduler"] = max(time.perf_counter() - began - sum(timings.values()), 0.0)
         timings["bake"] = self._bake_seconds
@@ -284,7 +289,8 @@ class FrameScheduler:
 
     def _new_frame(self, index: int, previous_index: int) -> Frame:
         now = frame_time(self.camera, index)
-        self.scene.update(now, frame_time(self.camera, previous_index), self.device)
+        follows = self._trail is not None and self._trail.index == previous_index != index
+        self.scene.update(now, frame_time(self.camera, previous_index), self.device, self._trail if follows else None)
         data = launch.copied(self.scene.data(self.device), types.SceneData)
         data.emitters, data.bvh = launch.copied(data.emitters, types.Emitters), launch.copied(data.bvh, types.Bvh)
         if self.scene.emitter_count:
@@ -380,18 +386,3 @@ class FrameScheduler:
         settings: dict[str, Setting] = {"lineage": lineage}
         settings |= {key: str(value) for key, value in self.metadata().items() if key != "scene_hash"}
         return Bake("FrameScheduler", self.scene.contents_hash, settings, arrays, scene_name=self.scene.name)
-
-
-def _bakes_by_class(bakes: Iterable[Bake], parts: dict[str, Stateful]) -> dict[str, list[Bake]]:
-    """Return the bakes by the class that they are for; raises BakeError for one that nothing uses."""
-    users = [part for part in parts.values() if isinstance(part, Estimator | RadianceCache)]
-    found: dict[str, list[Bake]] = {type(part).__name__: [] for part in users}
-    for one in bakes:
-        if one.technique not in found:
-            names = ", ".join(sorted(found)) or "none"
-            raise BakeError(
-                f"a bake of {one.technique} was given, but the pipeline's estimators are: {names}; leave it out, "
-                "or name another pipeline"
-            )
-        found[one.technique].append(one)
-    return found

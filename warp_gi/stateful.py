@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from warp_gi.plain import take_plain
 from warp_gi.scene.camera import views_hash
 
 if TYPE_CHECKING:
@@ -52,6 +53,8 @@ _EARLIER = {
 class Stateful:
     """Base of estimators, services, radiance caches, primaries and denoisers; a frozen dataclass of plain settings.
 
+    Numbers of NumPy's kinds become Python's own.
+
     The scheduler calls ``bake`` and ``start`` before the first frame, with the scene at time 0, whoever moved it
     before. For each frame it calls ``preprocess`` before rays are traced and ``after`` when the frame's sums are
     complete. Each returns a state and leaves the one that it was given as it is, arrays included: a frame that is
@@ -67,6 +70,7 @@ class Stateful:
                 raise TypeError(f"{cls.__name__}.{name} is of an earlier version and never called: {instead}")
 
     def __post_init__(self) -> None:
+        take_plain(self)
         self.validate()
 
     def validate(self) -> None:
@@ -100,6 +104,13 @@ class Stateful:
         """Return a hash of all in the scene that ``bake`` and ``start`` depend on; "" stands for ``scene.hash``.
 
         While the hash stays the same, a changed sky or light leaves bake and state as they are.
+        """
+        return ""
+
+    def state_key(self, scene: Scene | BakedScene) -> str:
+        """Return a hash of all in the scene that a state does not follow from frame to frame; "" is ``bake_key``.
+
+        When an edit changes it, the state is made anew before the next frame.
         """
         return ""
 

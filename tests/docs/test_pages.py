@@ -143,8 +143,24 @@ def test_examples_of_the_first_sequence_run(number, tmp_path, monkeypatch):
     ][number]
 
 
+@pytest.mark.parametrize(("number", "size"), [(0, "(320, 180)"), (1, "at_resolution(32, 32)")])
+def test_examples_of_edits_run(number, size, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    text = blocks(DOCS / "guide/edits.md", "python")[number]
+    assert size in text
+    found = run(text.replace("(320, 180)", "(64, 36)"))
+    if number == 0:
+        frames = [gi.read_frame(path).numpy("object_id") for path in sorted(tmp_path.rglob("*.exr"))]
+        assert len(frames) == 4 and all((frames[0] != frame).any() for frame in frames[1:])
+    else:
+        assert "(0.63, 0.065, 0.05)" in capsys.readouterr().out
+        assert found["wall"].base_color == pytest.approx(found["wanted"], rel=1e-3)
+
+
 def run(text):
-    exec(compile(text, "example", "exec"), {})
+    names = {}
+    exec(compile(text, "example", "exec"), names)
+    return names
 
 
 def test_the_example_of_a_kernel_test_passes(tmp_path):

@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_gi import launch
 from warp_gi.kernels import denoise
+from warp_gi.scene.hashing import light_of
 
 if TYPE_CHECKING:
     from warp_gi.frame import Frame
@@ -121,8 +122,3 @@ def _loaded(array: np.ndarray, dtype: type, count: int, device: wp.Device) -> wp
     if len(array) != count:
         raise ValueError(f"{len(array)} pixels instead of {count}")
     return wp.array(array, dtype=dtype, device=device)
-
-
-def light_of(scene: Scene | BakedScene) -> str:
-    """Return a hash of a scene's light; of all but the sky where that changes over time, little by little."""
-    return scene.contents_hash if scene.is_sky_animated else scene.hash

@@ -10,10 +10,11 @@ import numpy as np
 import warp as wp
 
 from warp_gi.denoise.base import Denoiser
-from warp_gi.denoise.history import ApartHistory, History, light_of, read_guides
+from warp_gi.denoise.history import ApartHistory, History, read_guides
 from warp_gi.errors import OptionError, check_whole
 from warp_gi.kernels import apart_lights, denoise, denoise_apart, denoise_edges, denoise_reflections
 from warp_gi.scene.apart import ApartLights, has_apart_lights
+from warp_gi.scene.hashing import light_of
 
 if TYPE_CHECKING:
     from warp_gi.baking import Bake

@@ -45,7 +45,7 @@ class BakedScene:
         self._guard = Guard()
         self.bake = bake
         self.name = bake.scene_name
-        self.contents_hash = bake.scene_key
+        self.contents_hash = self.light_hash = bake.scene_key
         self.hash = bake.digest
         self.cameras: dict[str, Camera] = {}
         self.offset = np.array(bake.arrays.get("offset", (0.0, 0.0, 0.0)), np.float64)
@@ -61,9 +61,14 @@ class BakedScene:
         """Lowest and highest corner of the scene in metres, float32 [2, 3]."""
         return self.bake.arrays["bounds"]
 
-    def update(self, time: float, previous_time: float | None = None, device: wp.DeviceLike = None) -> bool:
+    def update(
+        self, time: float, previous_time: float | None = None, device: wp.DeviceLike = None, trail: object = None
+    ) -> bool:
         """Return False: nothing moves."""
         return False
+
+    def trail_of(self, index: int, device: wp.DeviceLike = None) -> None:
+        """Return None: no frame sees anything move."""
 
     def update_sky(self, time: float) -> bool:
         """Return False: the sky is that of the bake."""

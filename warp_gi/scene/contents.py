@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from warp_gi.scene.geometry import FlatGeometry
+from warp_gi.scene.hulls import Hulls
 from warp_gi.scene.model import Material, Node, PunctualLight
 from warp_gi.scene.poses import Pose
 
@@ -16,10 +17,20 @@ if TYPE_CHECKING:
     from warp_gi.scene.environment import Environment
 
 
+class Forgetful(Protocol):
+    """Hashes that are computed anew after an edit."""
+
+    def forget(self, *names: str) -> None:
+        """Compute some of them anew when they are asked for."""
+        ...
+
+
 class SceneContents(Protocol):
     """A ``Scene`` as its own parts see it: the buffers on devices, and the watch over edits."""
 
     name: str
+    version: int
+    """Number of changes so far."""
     nodes: list[Node]
     lights: list[PunctualLight]
     materials: list[Material]
@@ -33,6 +44,15 @@ class SceneContents(Protocol):
     """Whether each node moves, by its index."""
     _poses: list[Pose]
     """Pose of each node at time 0."""
+    _hulls: Hulls
+    """Boxes around what moves and changes its shape."""
+    _bounds: np.ndarray
+    """Lowest and highest corner in metres, float32 [2, 3]."""
+
+    @property
+    def _digests(self) -> Forgetful:
+        """Hashes of what the scene holds."""
+        ...
 
     @property
     def _devices(self) -> Mapping[str, Any]:
@@ -42,6 +62,19 @@ class SceneContents(Protocol):
     @property
     def environment(self) -> Environment | None:
         """The present sky."""
+        ...
+
+    @environment.setter
+    def environment(self, value: Any) -> None: ...
+
+    @property
+    def is_sky_animated(self) -> bool:
+        """Whether the environment is a function of time."""
+        ...
+
+    @property
+    def duration(self) -> float:
+        """Time of the last keyframe in seconds."""
         ...
 
     @property

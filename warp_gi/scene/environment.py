@@ -41,7 +41,7 @@ LARGEST_RADIANCE = 1e30  # W/(m^2 sr); past it products of what kernels compute 
 NEGLIGIBLE_NEGATIVE = 1e-4  # share of the sum of all pixels; less is set to 0
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Environment:
     """A sky: a latitude-longitude map, a constant colour, or (neither given) black."""
 
@@ -56,6 +56,11 @@ class Environment:
     name: str = "environment"
     """Name in error messages."""
     _map: SkyMap | None = field(default=None, repr=False)
+
+    def __repr__(self) -> str:
+        shape = None if self.pixels is None else np.shape(self.pixels)
+        light = f"color {self.color}" if shape is None else f"{shape[1]} x {shape[0]} pixels"
+        return f"<Environment {self.name!r}: {light}, rotation {self.rotation:g}, scale {self.scale:g}>"
 
     def __post_init__(self) -> None:
         if self.pixels is not None and self.color is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,11 +48,7 @@ def check_nodes(nodes: Sequence[Node]) -> None:
     """Raise SceneError for a bad hierarchy, transform, keyframe or mesh, or if there is no triangle at all."""
     checked: set[int] = set()  # of a mesh that stands in many places once
     for index, node in enumerate(nodes):
-        if node.parent is not None and not 0 <= node.parent < index:
-            raise SceneError(f"node {node.name!r}: parent must stand before it (0 to {index - 1}), got {node.parent}")
-        matrix = np.asarray(node.parent_from_node)
-        if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-            raise SceneError(f"node {node.name!r}: parent_from_node must be a finite 4x4 matrix, got {matrix.tolist()}")
+        check_placement(node, index)
         if node.keyframes is not None:
             check_keyframes(node.keyframes, node.name)
         for mesh in node.meshes:
@@ -62,6 +58,15 @@ def check_nodes(nodes: Sequence[Node]) -> None:
         check_deformation(node, nodes)
     if not any(len(mesh.indices) for node in nodes for mesh in node.meshes):
         raise SceneError("the scene has no triangles; give at least one mesh with faces")
+
+
+def check_placement(node: Node, index: int) -> None:
+    """Raise SceneError unless a node has a finite matrix, and a parent before it, if any."""
+    if node.parent is not None and not 0 <= node.parent < index:
+        raise SceneError(f"node {node.name!r}: parent must stand before it (0 to {index - 1}), got {node.parent}")
+    matrix = np.asarray(node.parent_from_node)
+    if matrix.shape != (4, 4) or matrix.dtype.kind not in "biuf" or not np.isfinite(matrix).all():
+        raise SceneError(f"node {node.name!r}: parent_from_node must be a finite 4x4 matrix, got {matrix.tolist()}")
 
 
 def check_mesh(mesh: Mesh, owner: str) -> None:
@@ -177,12 +182,15 @@ def _finite_uvs(uvs: np.ndarray) -> np.ndarray:
 
 def place(flat: FlatGeometry, node: Node, pose: Pose, vertex: int) -> None:
     """Write points and normals of ``node``'s meshes in a pose from ``vertex`` on."""
-    for mesh in node.meshes:
-        end = vertex + len(mesh.points)
-        points, normals = pose.vertices(mesh)
+    write(flat, (pose.vertices(mesh) for mesh in node.meshes), vertex)
+
+
+def write(flat: FlatGeometry, pieces: Iterable[tuple[np.ndarray, np.ndarray | None]], vertex: int) -> None:
+    """Write points and normals of meshes, one after another, from ``vertex`` on; no normals are flat shading."""
+    for points, normals in pieces:
+        end = vertex + len(points)
         flat.points[vertex:end] = points
-        if normals is not None:
-            flat.normals[vertex:end] = normals
+        flat.normals[vertex:end] = 0.0 if normals is None else normals
         vertex = end
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from warp_gi.scene.poses import deforms
 if TYPE_CHECKING:
     from warp_gi.scene.contents import SceneContents
     from warp_gi.scene.environment import Environment
-    from warp_gi.scene.model import Node
+    from warp_gi.scene.model import Node, Texture
 
 
 def geometry_hash(scene: SceneContents) -> str:
@@ -64,49 +65,106 @@ def shape_hash(node: Node) -> str:
     return digest.hexdigest()
 
 
-class Hashes:
-    """Hashes of a scene. They are kept once it is on a device: until then its materials and lights may be edited."""
+class Digests:
+    """Hashes of a scene, each computed when it is asked for; on a device it is kept until what it is of changes.
 
-    def __init__(self) -> None:
-        self._geometry: str | None = None
-        self._surfaces: hashlib._Hash | None = None
+    A colour in a loop, or a sky that changes from frame to frame, must not cost a pass over all textures. Before
+    there is a device, materials and lights may be edited, and nobody looks for that.
+    """
 
-    def geometry(self, scene: SceneContents) -> str:
-        """Return ``geometry_hash``."""
-        found = geometry_hash(scene) if self._geometry is None else self._geometry
-        if scene._devices:
-            self._geometry = found
+    def __init__(self, scene: SceneContents) -> None:
+        self._scene = scene
+        self._known: dict[str, str] = {}
+        self._light: str | None = None
+
+    def forget(self, *names: str) -> None:
+        """Compute some anew when they are asked for: "geometry", "normals", "surfaces", "images", "light".
+
+        That of all contents is computed anew too.
+        """
+        for name in (*names, "contents"):
+            self._known.pop(name, None)
+        if "light" in names:
+            self._light = None
+
+    def geometry(self) -> str:
+        """Return the hash of all that decides visibility."""
+        return self._once("geometry", lambda: geometry_hash(self._scene))
+
+    def contents(self) -> str:
+        """Return the hash of all that decides the pictures, except cameras and sky."""
+        return self._once("contents", self._contents)
+
+    def light(self) -> str:
+        """Return ``contents`` as it was before nodes and points were moved by edits."""
+        if self._light is not None:
+            return self._light
+        found = self.contents()
+        if self._scene._devices:
+            self._light = found
         return found
 
-    def contents(self, scene: SceneContents) -> str:
-        """Return the SHA-256 of all that decides the pictures, except cameras and sky. Lights are read anew."""
-        found = _surfaces(scene, self.geometry(scene)) if self._surfaces is None else self._surfaces
-        if scene._devices:
-            self._surfaces = found
-        return _with_lights(scene, found)
+    def _once(self, name: str, compute: Callable[[], str]) -> str:
+        if name in self._known:
+            return self._known[name]
+        found = compute()
+        if self._scene._devices:
+            self._known[name] = found
+        return found
+
+    def _contents(self) -> str:
+        scene, flat = self._scene, self._scene._flat
+        images = textures.distinct_textures(scene.materials)
+        surfaces = [flat.uvs, flat.materials, flat.objects]
+        surfaces += [part for part in (flat.colors, flat.further_uvs) if part is not None]
+        parts = (
+            self._once("normals", lambda: _hash_of(flat.normals)),
+            self._once("surfaces", lambda: _hash_of(*surfaces)),
+            self._once("images", lambda: _hash_of(*(one for image in images for one in _image_parts(image)))),
+        )
+        digest = hashlib.sha256(b"warp_gi scene 2" + self.geometry().encode())
+        _update(digest, *parts, textures.material_table(scene.materials, images))
+        world = animation.world_matrices(scene.nodes, 0.0)
+        _update(digest, emitters.emitter_table(scene._emissive, scene.lights, world))
+        _update(digest, repr([light.node for light in scene.lights]))
+        return digest.hexdigest()
 
 
-def _surfaces(scene: SceneContents, geometry: str) -> hashlib._Hash:
-    """Return the digest of all that surfaces are, from the hash of the geometry."""
-    digest = hashlib.sha256(b"warp_gi scene 1" + geometry.encode())
-    flat = scene._flat
-    _update(digest, flat.normals, flat.uvs, flat.materials, flat.objects)
-    _update(digest, *(part for part in (flat.colors, flat.further_uvs) if part is not None))
-    images = textures.distinct_textures(scene.materials)
-    _update(digest, textures.material_table(scene.materials, images))
-    for image in images:
-        how = image.srgb, image.wrap, image.nearest, image.uv_set, image.transform
-        _update(digest, repr(how), image.pixels)
-    return digest
+def _image_parts(image: Texture) -> tuple[str, np.ndarray]:
+    return repr((image.srgb, image.wrap, image.nearest, image.uv_set, image.transform)), image.pixels
 
 
-def _with_lights(scene: SceneContents, surfaces: hashlib._Hash) -> str:
-    """Return the SHA-256 of surfaces and of the lights as they are now."""
-    digest = surfaces.copy()
-    world = animation.world_matrices(scene.nodes, 0.0)
-    _update(digest, emitters.emitter_table(scene._emissive, scene.lights, world))
-    _update(digest, repr([light.node for light in scene.lights]))
+def _hash_of(*parts: np.ndarray | str) -> str:
+    digest = hashlib.sha256()
+    _update(digest, *parts)
     return digest.hexdigest()
+
+
+class Lit(Protocol):
+    """A scene, or what is left of one, as ``light_of`` sees it."""
+
+    @property
+    def light_hash(self) -> str:
+        """Hash of all but the sky, as it was before edits moved anything."""
+        ...
+
+    @property
+    def environment(self) -> Environment | None:
+        """The present sky."""
+        ...
+
+    @property
+    def is_sky_animated(self) -> bool:
+        """Whether the sky changes over time."""
+        ...
+
+
+def light_of(scene: Lit) -> str:
+    """Return a hash of a scene's light; of all but the sky where that changes over time, little by little.
+
+    Nodes and points that edits move are left out, as those that keyframes move: what is kept over frames follows them.
+    """
+    return scene.light_hash if scene.is_sky_animated else with_sky(scene.light_hash, scene.environment)
 
 
 def with_sky(contents: str, sky: Environment | None) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,29 +14,42 @@ if TYPE_CHECKING:
     from warp_gi.kernels import types
 
 
-def row_edit(material: Material, data: types.SceneData, row: int, hint: str) -> str | None:
-    """Return the first field in which a material differs from its row in the tables of a device, or ``hint``."""
+FLAGS = ("alpha_cutoff", "alpha_blend", "double_sided", "colors_emit")
+"""Fields of materials that are neither numbers nor textures."""
+
+
+def row_edits(material: Material, data: types.SceneData, row: int, hint: str) -> Iterator[str]:
+    """Yield the fields in which a material differs from its row in the tables of a device; ``hint`` if it is none.
+
+    ``hint`` is the field that may be another. Texels are compared unless it is a number.
+    """
     try:
         textures.check_material(material)
     except (ValueError, TypeError, AttributeError):
-        return hint
+        yield hint
+        return
     images = textures.distinct_textures([material])
     new, old = textures.material_table([material], images)[0], data.materials.numpy()[row]
     for field in new.dtype.names or ():
         if field not in textures.TEXTURE_SLOTS:
             if not np.array_equal(new[field], old[field]):
-                return field
+                yield field
         elif (new[field] < 0) != (old[field] < 0):
-            return field
-        elif new[field] >= 0:
+            yield field
+        elif new[field] >= 0 and hint not in (*textures.NUMBERS, *FLAGS):
             entry, image = data.textures.numpy()[old[field]], images[new[field]]
             table, texels = textures.texture_table([image])
             first, *others = table.dtype.names or ()
             start = int(entry[first])
             is_same = all(np.array_equal(entry[name], table[0][name]) for name in others)
             if not is_same or not np.array_equal(data.texels.numpy()[start : start + len(texels)], texels):
-                return f"{field} {image.name!r}"
-    return None
+                yield f"{field} {image.name!r}"
+
+
+def passes_rays(data: types.SceneData, row: int) -> bool:
+    """Return whether a material lets rays pass by its row in the tables of a device."""
+    old = data.materials.numpy()[row]
+    return bool(old["alpha_cutoff"] >= 0.0 or old["alpha_blend"] or old["transmission"] > 0.0)
 
 
 def alike(a: Material, b: Material) -> bool:

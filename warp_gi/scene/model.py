@@ -9,7 +9,7 @@ import numpy as np
 Color = tuple[float, float, float]
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Texture:
     """An 8-bit image."""
 
@@ -28,6 +28,10 @@ class Texture:
     transform: tuple[Color, Color] | None = None
     """Rows of the affine map from those coordinates to the texture's own, v up: u' = row 0 . (u, v, 1), and v' of row
     1; None is the identity, and has to be for a base colour."""
+
+    def __repr__(self) -> str:
+        size = " x ".join(map(str, np.shape(self.pixels)[1::-1]))
+        return f"<Texture {self.name!r}: {size} pixels, {'sRGB' if self.srgb else 'linear'}>"
 
 
 @dataclass(eq=False)
@@ -103,7 +107,7 @@ class Material:
         return self.alpha_cutoff is not None or self.has_chance
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Mesh:
     """Triangles of one material, in the space of their object."""
 
@@ -130,6 +134,13 @@ class Mesh:
     """Joints that each vertex follows where a node has a ``skin``: indices in ``Skin.joints``, [vertex, influence]."""
     joint_weights: np.ndarray | None = None
     """How much it follows each of them, from 0 up, float32 [vertex, influence]; they count relative to their sum."""
+
+    def __repr__(self) -> str:
+        has = [
+            name for name in ("normals", "uvs", "further_uvs", "colors", "joints") if getattr(self, name) is not None
+        ]
+        parts = [f"{len(self.points):,} vertices", f"{len(self.indices):,} triangles"]
+        return f"<Mesh {self.name!r}: {', '.join([*parts, f'material {self.material.name!r}', *has])}>"
 
 
 @dataclass(eq=False)
@@ -166,7 +177,7 @@ class PunctualLight:
     """Index in Scene.nodes of the node that carries the light, and in whose space it is given; None is the world."""
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Node:
     """A named placement of meshes; the objects of a scene. Parents come before children."""
 
@@ -187,6 +198,16 @@ class Node:
     """Nodes that the vertices of the meshes follow; the placement of this node is then of no account for them."""
     morphs: list[MorphKeyframe] | None = None
     """Weights of the meshes' morph targets over time; None is none of them."""
+
+    def __repr__(self) -> str:
+        where = np.asarray(self.parent_from_node, np.float64)[:3, 3]
+        parts = [
+            f"at ({', '.join(f'{x:g}' for x in where)}) m",
+            *([] if self.parent is None else [f"below node {self.parent}"]),
+            *([f"{len(self.keyframes)} keyframes"] if self.keyframes else []),
+            *(repr(mesh) for mesh in self.meshes),
+        ]
+        return f"<Node {self.name!r}: {', '.join(parts)}>"
 
 
 @dataclass(eq=False)

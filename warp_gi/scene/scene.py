@@ -9,28 +9,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from warp_gi.errors import SceneError, unknown_name
 from warp_gi.forks import Guard
 from warp_gi.kernels import types
 from warp_gi.launch import get_device
-from warp_gi.scene import animation, copying, emitters, geometry, hashing, hulls, poses, textures
-from warp_gi.scene.device_scene import DeviceScene
+from warp_gi.scene import animation, copying, emitters, following, geometry, hashing, hulls, poses, textures
+from warp_gi.scene.device_scene import DeviceScene, Trail
 from warp_gi.scene.edits import Edits
-from warp_gi.scene.emission_grids import LightGrids
-from warp_gi.scene.model import Keyframe, Material, Node, PunctualLight
+from warp_gi.scene.model import Keyframe, Material, Mesh, Node, PunctualLight
 from warp_gi.scene.sky_motion import appearance, first_sky, sky_at_time
 
 if TYPE_CHECKING:
     from warp_gi.bvh import TriangleBvh
     from warp_gi.scene.environment import Environment, Sky
     from warp_gi.scene.pinhole import Camera
-
-POSES_FOR_BOUNDS = 33
-"""Number of evenly spaced poses, beside those of the keyframes, that the bounds of an animated scene enclose."""
-
-POSES_FOR_AREAS = 9
-"""Number of evenly spaced poses over which areas of lamps that change their shape are averaged."""
 
 
 class Scene:
@@ -48,8 +42,8 @@ class Scene:
     Raises SceneError if anything in it cannot be rendered: one line that names the mesh, material or light.
 
     What pictures are made from is copied: geometry when the scene is made, and by ``animate``; all else when first
-    used on a device. An edit after that is a SceneError at the next frame, see ``check_unchanged``. What works at any
-    time is ``animate`` and an assignment of ``environment``.
+    used on a device. The next frame follows edits after that: placements of nodes, materials, textures, lights and the
+    sky by assignment, points by ``set_points``. Others are a SceneError there, see ``check_unchanged``.
     """
 
     def __init__(
@@ -99,13 +93,11 @@ class Scene:
         self._hulls = hulls.hulls_of(self.nodes, self._moving)
         if not np.isfinite(self._flat.points).all():
             raise SceneError(f"scene {self.name!r}: node transforms move vertices past the range of float32")
-        times = np.linspace(0.0, self.duration, POSES_FOR_AREAS)
-        self._flat.mean_areas = emitters.mean_areas(self.nodes, self._flat, self._moving, times)
-        self._emissive, powers = emitters.emissive_triangles(self._flat, self.materials)
-        self._light_grids = LightGrids(self._flat, self.materials, self._emissive, powers)
-        self._bounds = self._all_bounds()
+        following.set_areas(self)
+        self._emissive, self._light_grids = following.lights_of(self)
+        self._bounds = following.bounds_of(self)
         self._devices: dict[str, DeviceScene] = {}
-        self._hashes = hashing.Hashes()
+        self._digests = hashing.Digests(self)
         self._edits = Edits(self)
 
     # ---- what is in it ----
@@ -233,7 +225,7 @@ class Scene:
     @property
     def geometry_hash(self) -> str:
         """SHA-256 of all that decides visibility: triangles, alpha masks, animation."""
-        return self._hashes.geometry(self)
+        return self._digests.geometry()
 
     @property
     def hash(self) -> str:
@@ -242,30 +234,49 @@ class Scene:
 
     @property
     def contents_hash(self) -> str:
-        """SHA-256 of all that decides the pictures, except cameras and sky.
+        """SHA-256 of all that decides the pictures, except cameras and sky; computed once for each edit."""
+        return self._digests.contents()
 
-        It follows edits until the first frame. From then on only lights that frames read anew are hashed anew: a sky
-        that changes from frame to frame must not cost a pass over all textures.
-        """
-        return self._hashes.contents(self)
+    @property
+    def light_hash(self) -> str:
+        """``contents_hash`` as it was before edits moved nodes and points, as keyframes do without another hash."""
+        return self._digests.light()
 
     # ---- what moves ----
+
+    def node(self, name: str) -> Node:
+        """Return the node of a name, whose fields may be edited between frames.
+
+        Raises SceneError if several nodes have the name, OptionError if none has.
+        """
+        matches = [candidate for candidate in self.nodes if candidate.name == name]
+        if not matches:
+            raise unknown_name("node", name, {candidate.name for candidate in self.nodes})
+        if len(matches) > 1:
+            raise SceneError(f"{len(matches)} nodes are named {name!r}; give the one that is meant a name of its own")
+        return matches[0]
 
     def animate(self, node: str, keyframes: Sequence[Keyframe]) -> None:
         """Replace the pose of a node (in its parent's space) by keyframes; bakes and device buffers start afresh.
 
         Raises SceneError for bad keyframes or if several nodes have the name, OptionError if none has.
         """
-        matches = [index for index, candidate in enumerate(self.nodes) if candidate.name == node]
-        if not matches:
-            raise unknown_name("node", node, {candidate.name for candidate in self.nodes})
-        if len(matches) > 1:
-            raise SceneError(f"{len(matches)} nodes are named {node!r}; give the one to animate a name of its own")
+        target = self.node(node)
         animation.check_keyframes(keyframes, node)
         geometry.check_nodes(self.nodes)  # they are read anew, with every edit so far
         with self.lock:
-            animation.set_keyframes(self.nodes[matches[0]], keyframes, self.offset)
+            animation.set_keyframes(target, keyframes, self.offset)
             self._flatten()
+
+    def set_points(self, mesh: Mesh | Node, points: ArrayLike, normals: ArrayLike | None = None) -> None:
+        """Move the vertices of a mesh, wherever it stands in the scene, or of a node that has one mesh alone.
+
+        ``points`` [m] and ``normals`` are float32 [vertex, 3] in the space of the mesh, as many as there are. Without
+        ``normals`` a mesh keeps those that it has. Raises SceneError for another number of them, and for values that
+        are not finite; then nothing has changed.
+        """
+        with self.lock:
+            following.set_points(self, mesh, points, normals)
 
     def moves(self, index: int) -> bool:
         """Return whether node ``index``, or one above it, has keyframes, or its meshes change their shape."""
@@ -294,17 +305,32 @@ class Scene:
         """Return the placement of node ``index`` at ``time`` [s], float64 [4, 4]."""
         return animation.world_matrices(self.nodes, time)[index]
 
-    def update(self, time: float, previous_time: float | None = None, device: str | wp.Device | None = None) -> bool:
+    def update(
+        self,
+        time: float,
+        previous_time: float | None = None,
+        device: str | wp.Device | None = None,
+        trail: Trail | None = None,
+    ) -> bool:
         """Move what is in ``data(device)`` to ``time`` [s]; return whether anything differs from the last call.
 
-        ``previous_points`` get the pose of ``previous_time``, from which motion vectors
-        follow; None is ``time``, no motion. Nothing is done for a scene without keyframes,
-        and the tree is refit only if a vertex moved. The sky is moved by ``update_sky``.
+        ``previous_points`` get the pose of ``previous_time``, from which motion vectors follow; None is ``time``, no
+        motion. They get that of the frame before instead where ``trail`` holds it (``trail_of``). Nothing is done for
+        a scene in which nothing ever moved, and the tree is refit only if a vertex moved. The sky is moved by
+        ``update_sky``.
         """
         with self.lock:
             self.data(device)
-            previous = time if previous_time is None else previous_time
-            return self.is_animated and self._devices[_device(device).alias].move(time, previous)
+            there = self._devices[_device(device).alias]
+            if not self.is_animated and not there.is_parted:
+                return False
+            return there.move(time, time if previous_time is None else previous_time, trail)
+
+    def trail_of(self, index: int, device: str | wp.Device | None = None) -> Trail:
+        """Return where frame ``index`` sees the scene, as ``data(device)`` is now, for ``update`` of the next one."""
+        with self.lock:
+            self.data(device)
+            return self._devices[_device(device).alias].trail(index)
 
     # ---- what kernels read ----
 
@@ -329,11 +355,12 @@ class Scene:
             return self._devices[_device(device).alias].placed_emitters()
 
     def check_unchanged(self) -> None:
-        """Raise SceneError if something was edited that pictures would not show: one line that says what, and the cure.
+        """Take edits over, or raise SceneError for one that cannot be followed: a line that says what, and the cure.
 
         Called for every frame. It reads all arrays of meshes and textures, and the pixels of the sky.
         """
-        self._edits.check()
+        with self.lock:
+            self._edits.check()
 
     def light_table(self, device: str | wp.Device | None = None) -> wp.array:
         """Return an alias table that picks emitters by power, AliasBucket [emitter_count]; built once a device."""
@@ -351,19 +378,6 @@ class Scene:
         with self.lock:
             self.data(device)
             return self._devices[_device(device).alias].static_bvh()
-
-    def _all_bounds(self) -> np.ndarray:
-        flat = self._flat
-        used = np.unique(flat.indices) if len(flat.points) > 3 * len(flat.indices) else slice(None)
-        boxes = [np.stack([flat.points[used].min(axis=0), flat.points[used].max(axis=0)])]
-        if self.is_animated:
-            evenly = np.linspace(0.0, self.duration, POSES_FOR_BOUNDS)
-            for swept in (
-                animation.swept_box(self.nodes, self._moving, evenly),
-                hulls.swept_box(self.nodes, self._hulls, evenly),
-            ):
-                boxes += [swept] if np.isfinite(swept).all() else []
-        return np.stack([np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))]).astype(np.float32)
 
 
 def _device(device: str | wp.Device | None) -> wp.Device:

@@ -94,10 +94,10 @@ def distinct_textures(materials: Sequence[Material]) -> list[Texture]:
     return list(found.values())
 
 
-def texture_table(textures: Sequence[Texture]) -> tuple[np.ndarray, np.ndarray]:
+def texture_table(textures: Sequence[Texture], with_texels: bool = True) -> tuple[np.ndarray, np.ndarray]:
     """Return the table (dtype of types.Texture) and the texels (uint32, red in the low byte, bottom row first).
 
-    Textures that share one array of pixels share their texels. Raises SceneError
+    Textures that share one array of pixels share their texels. Without texels there are none, [0]. Raises SceneError
     past 2**31 texels.
     """
     images = list({id(texture.pixels): texture.pixels for texture in textures}.values())
@@ -105,12 +105,13 @@ def texture_table(textures: Sequence[Texture]) -> tuple[np.ndarray, np.ndarray]:
     if sum(sizes) >= 2**31:
         raise SceneError(f"textures hold {sum(sizes)} texels, more than 2^31; scale them down")
     starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    texels = np.empty(max(int(starts[-1]), 1), np.uint32)
+    texels = np.empty(max(int(starts[-1]), 1) if with_texels else 0, np.uint32)
     texels[starts[-1] :] = 0
     start_of = {}
     for image, start, size in zip(images, starts, sizes, strict=False):
         start_of[id(image)] = start
-        texels[start : start + size].view(np.uint8).reshape(image.shape)[:] = image[::-1]
+        if with_texels:
+            texels[start : start + size].view(np.uint8).reshape(image.shape)[:] = image[::-1]
     table = np.zeros(len(textures), types.Texture.numpy_dtype())
     for index, texture in enumerate(textures):
         height, width = texture.pixels.shape[:2]

@@ -16,7 +16,7 @@ from warp_gi.kernels import path_trace, transfer_light, transfer_shade
 from warp_gi.kernels.transfer_snippets import ORDERS
 from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import whole_scene
-from warp_gi.stateful import Service
+from warp_gi.stateful import Ahead, Service
 from warp_gi.techniques.radiance_transfer.bake import bake_transfer, transfer_key
 from warp_gi.techniques.radiance_transfer.settings import TransferSettings
 from warp_gi.techniques.radiance_transfer.sky import SkyLight, TransferLight
@@ -194,7 +194,11 @@ class RadianceTransfer(Estimator, RadianceCache):
         scene = whole_scene(scene)
         self._check_lamps(scene)
         state = transfer_state(bake or self.bake(scene, device, seed), device)
-        return replace(state, needs_rays=needs_rays(scene, state.bare_faces, self._traced_below))
+        return self._of_surfaces(scene, state)
+
+    def _of_surfaces(self, scene: Scene, state: TransferState) -> TransferState:
+        needs = needs_rays(scene, state.bare_faces, self._traced_below)
+        return replace(state, needs_rays=needs, surfaces=scene.light_hash)
 
     def _check_lamps(self, scene: Scene) -> None:
         """Raise OptionError for indirect light of lamps that move."""
@@ -205,6 +209,15 @@ class RadianceTransfer(Estimator, RadianceCache):
             )
 
     # ---- frames ----
+
+    def preprocess(self, frame: Frame, state: TransferState) -> TransferState:
+        """Return the state for the materials of now: a bake without bounces serves all of them."""
+        scene = whole_scene(frame.scene)
+        return state if state.surfaces == scene.light_hash else self._of_surfaces(scene, state)
+
+    def depends_on_past(self, scene: Scene | BakedScene, ahead: Ahead | None = None) -> bool:
+        """Return False: the state follows from the bake and the materials."""
+        return False
 
     def give(self, frame: Frame, state: TransferState) -> None:
         """Let paths end in what is known of light that was reflected before."""

@@ -30,6 +30,8 @@ class TransferState:
     """Faces whose fronts find no slot, int32 [n]: those that move among them."""
     needs_rays: bool = True
     """Whether a scene has surfaces whose light takes rays: what moves, what has no slots, or sharp lobes."""
+    surfaces: str = ""
+    """``Scene.light_hash`` of the scene that this is so of."""
 
 
 _states: weakref.WeakKeyDictionary[Bake, dict[str, TransferState]] = weakref.WeakKeyDictionary()

@@ -17,6 +17,7 @@ from warp_gi.kernels.surface_cache import SURFACE_CACHE, SurfaceCells
 from warp_gi.kernels.surface_cache_fill import fill_cells
 from warp_gi.radiance_cache import RadianceCache
 from warp_gi.scene.baked import whole_scene
+from warp_gi.scene.hashing import light_of
 from warp_gi.stateful import Ahead
 from warp_gi.techniques.shared.views import ROW, camera_rows, cameras_of, known_rows
 from warp_gi.techniques.surface_cache.cells import NOTHING, with_table
@@ -111,6 +112,10 @@ class SurfaceCache(RadianceCache):
         """Return the hash of all of the scene, but not of a sky that changes over time."""
         return scene.contents_hash if scene.is_sky_animated else scene.hash
 
+    def state_key(self, scene: Scene | BakedScene) -> str:
+        """Return the hash of the light: cells follow what moves, and are filled anew for other materials and lights."""
+        return light_of(scene)
+
     def bake_settings(self, scene: Scene | BakedScene) -> dict[str, Setting]:
         """Return the settings that a bake depends on."""
         return self.fill_settings.stored()
@@ -187,13 +192,16 @@ class SurfaceCache(RadianceCache):
         grid: SurfaceCells = grid_at(arrays["low"], float(arrays["side"][0]), self.growth, arrays["boxes"], target)
         grid.traced_below, grid.residual = self.traced_below, self.residual
         cells = with_table(grid, arrays["keys"], arrays["cells"], target)
-        return CacheState(cells, follows=bool(is_moving(whole)))
+        return CacheState(cells, bool(is_moving(whole)), whole.geometry_hash)
 
     # ---- frames ----
 
     def preprocess(self, frame: Frame, state: CacheState) -> CacheState:
-        """Return the cells of this frame: in a scene that moves they get new samples, and old ones lose weight."""
-        if not state.follows:
+        """Return the cells of this frame: in a scene that moves they get new samples, and old ones lose weight.
+
+        So they do once an edit has moved something.
+        """
+        if not state.follows and state.geometry == whole_scene(frame.scene).geometry_hash:
             return state
         return followed(frame, state, self.fill_settings, Refresh(self.refresh, self.memory))
 

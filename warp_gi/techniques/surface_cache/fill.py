@@ -184,6 +184,12 @@ def empty_grid(scene: Scene, settings: FillSettings, boxes: np.ndarray, device: 
     return grid_at(low - side, side, settings.growth, boxes, device)
 
 
+def holds(grid: SurfaceCells, scene: Scene) -> bool:
+    """Return whether all of a scene lies in a grid."""
+    low, (lowest, highest) = np.array(grid.low, np.float64), scene.bounds.astype(np.float64)
+    return bool((low <= lowest).all() and (highest < low + grid.side * int(LARGEST_COORDINATE)).all())
+
+
 def grid_at(low: np.ndarray, side: float, growth: float, boxes: np.ndarray, device: wp.Device) -> SurfaceCells:
     """Return a grid without a cell in its table: its corner and side, and boxes float32 [box, 2, 3], in metres."""
     grid = SurfaceCells()

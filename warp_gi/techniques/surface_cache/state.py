@@ -13,7 +13,16 @@ from warp_gi.frame import Frame
 from warp_gi.kernels.surface_cache import SurfaceCells
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.techniques.surface_cache.cells import NOTHING, Sums, coarser
-from warp_gi.techniques.surface_cache.fill import FillSettings, add_pass, fill, fill_lights, object_grids, table_of
+from warp_gi.techniques.surface_cache.fill import (
+    FillSettings,
+    add_pass,
+    empty_grid,
+    fill,
+    fill_lights,
+    holds,
+    object_grids,
+    table_of,
+)
 
 if TYPE_CHECKING:
     from warp_gi.scene.scene import Scene
@@ -40,6 +49,8 @@ class CacheState:
     """Cells as kernels read them."""
     follows: bool = field(default=False, metadata={"derived": True})
     """Whether the scene or its sky moves, so that cells follow from frame to frame."""
+    geometry: str = field(default="", metadata={"derived": True})
+    """``Scene.geometry_hash`` of what the cells lie on."""
     keys: np.ndarray = field(default_factory=lambda: NOTHING.keys)
     """Keys of the smallest cells, uint64 [cell]; none in a scene at rest, whose cells never change."""
     light: np.ndarray = field(default_factory=lambda: NOTHING.light)
@@ -73,15 +84,21 @@ def is_moving(scene: Scene | BakedScene) -> str:
 def followed(frame: Frame, state: CacheState, settings: FillSettings, refresh: Refresh) -> CacheState:
     """Return the cells of a frame: what earlier frames left, of less weight, and samples of this one.
 
-    After a gap of many frames, and in the first one, all cells are filled anew, by all paths.
+    After a gap of many frames, and in the first one, all cells are filled anew, by all paths. So they are in the first
+    frame after an edit of a scene at rest moved something, and when something is moved past the grid.
     """
     scene, device = whole_scene(frame.scene), frame.device
     grid = launch.copied(state.cells, SurfaceCells)
     grid.objects = object_grids(scene, frame.time, device)
     last = int(state.frame[0])
-    if frame.index == last:
+    is_edited = scene.geometry_hash != state.geometry
+    if frame.index == last and not is_edited:
         return state
-    left = refresh.memory ** abs(frame.index - last) if last >= 0 else 0.0
+    if is_edited and not holds(grid, scene):
+        grid, last = empty_grid(scene, settings, grid.boxes.numpy(), device), -1
+        grid.traced_below, grid.residual = state.cells.traced_below, state.cells.residual
+        grid.objects = object_grids(scene, frame.time, device)
+    left = refresh.memory ** abs(frame.index - last) if last >= 0 and frame.index != last else 0.0
     if left < LEAST_LEFT:
         sums, _ = fill(scene, settings, grid, [frame.camera], device, frame.seed)
     else:
@@ -103,7 +120,8 @@ def followed(frame: Frame, state: CacheState, settings: FillSettings, refresh: R
                     scene, settings, cells, [frame.camera], done, refresh.refresh, frame.seed, device, lights
                 )
     cells = table_of(grid, sums, settings.capacity, device, tells=last < 0)
-    return CacheState(cells, True, sums.keys, sums.light, 1.0 * sums.counts, np.array([frame.index]), sums.keys)
+    weights, index = 1.0 * sums.counts, np.array([frame.index])
+    return CacheState(cells, True, scene.geometry_hash, sums.keys, sums.light, weights, index, sums.keys)
 
 
 def still_valid(old: Sums, new: Sums) -> Sums:

@@ -293,7 +293,8 @@ class VisibilityField(Estimator):
     def _relight_key(self, frame: Frame, state: FieldState) -> tuple[object, ...]:
         poses = b"" if state.poses is None else state.poses.tobytes()
         camera = frame.camera
-        return camera.world_from_camera.tobytes(), camera.lens, poses, len(state.cells)
+        surfaces = frame.scene.contents_hash  # an edit changes albedo or normals
+        return surfaces, camera.world_from_camera.tobytes(), camera.lens, poses, len(state.cells)
 
 
 def _is_black(scene: Scene | BakedScene) -> bool:
