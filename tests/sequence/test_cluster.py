@@ -8,6 +8,7 @@ import logging
 import random
 import re
 import threading
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -152,6 +153,7 @@ def test_killed_workers_lose_nothing(name, tmp_path):
     arguments = {"frames": range(count), "seed": 3}
     list(gi.render(scene, path, PIPELINES[name], output=tmp_path / "one" / "a.####.exr", **arguments))
     (tmp_path / "logs").mkdir()
+    killed = []
     with workers(tmp_path / "logs", 3) as running:
         ended = threading.Event()
 
@@ -160,6 +162,7 @@ def test_killed_workers_lose_nothing(name, tmp_path):
                 if ended.wait(rng.uniform(1.0, 4.0)):
                     return
                 running.kill(rng.randrange(len(running.processes)))
+                killed.append(time.monotonic())
                 running.start()
 
         def look():
@@ -178,6 +181,7 @@ def test_killed_workers_lose_nothing(name, tmp_path):
             ended.set()
             for thread in threads:
                 thread.join()
+    assert killed
     assert_same(tmp_path / "many", tmp_path / "one", count)
     assert {file.name: file.stat().st_mtime_ns for file in (tmp_path / "many").glob("*.exr")} == seen
 

@@ -30,6 +30,8 @@ from warp_gi.sequence.resume import Plan, SequenceRun
 
 ANSWER_SECONDS = 10.0
 """Seconds for which a scheduler is waited for."""
+PATIENCE_SECONDS = 120.0
+"""Seconds for which workers are asked again, if one after another dies meanwhile."""
 LOOK_SECONDS = 2.0
 """Seconds between two looks at which workers there are."""
 _LOG = logging.getLogger("warp_gi")
@@ -216,13 +218,20 @@ class Cluster:
 
     def _ask(self, call: Callable[[], Any]) -> Any:
         """Return what a call returns, again if a worker dies meanwhile; raises OSError if the scheduler is gone."""
-        deadline = time.monotonic() + ANSWER_SECONDS
+        began = connected = time.monotonic()
         while True:
-            with contextlib.suppress(OSError, TimeoutError):
+            problem = ""
+            try:
                 if self.client.status == "running":
+                    connected = time.monotonic()
                     return call()
-            if self.client.status == "closed" or time.monotonic() > deadline:
+            except (OSError, TimeoutError) as error:  # also of a worker that dies while it is asked
+                problem = one_line(error, type(error).__name__)
+            now = time.monotonic()
+            if self.client.status == "closed" or (not problem and now - connected > ANSWER_SECONDS):
                 raise self._gone()
+            if now - began > PATIENCE_SECONDS:
+                raise OSError(f"the Dask scheduler's workers cannot be asked ({problem}); finished frames are kept")
             time.sleep(0.1)
 
     @property
