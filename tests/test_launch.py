@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_gi import launch
+from warp_gi import launch, loading
 from warp_gi.errors import OptionError
 
 CPU = wp.get_device("cpu")
@@ -142,3 +142,26 @@ def test_the_linker_is_called_under_the_lock_that_a_fork_takes(monkeypatch):
     out = wp.zeros(5000, dtype=wp.int32, device=CPU)
     launch.launch(count, 5000, [out], CPU)
     assert was_free == [False] and (out.numpy() == np.arange(5000)).all()
+
+
+def test_of_two_processes_one_compiles_a_module(tmp_path, monkeypatch):
+    """The other one waits, and finds the module in the cache; what is no kernel of this package is left alone."""
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    module = SimpleNamespace(name="warp_gi.kernels.made_up", get_module_identifier=lambda block: f"wp_made_up_{block}")
+    order = []
+
+    def compile_it(name, inside):
+        with loading.alone(SimpleNamespace(module=module), 1):
+            order.append(f"{name} begins, {'found' if (tmp_path / 'wp_made_up_1').is_dir() else 'compiles'}")
+            inside()
+            (tmp_path / "wp_made_up_1").mkdir(exist_ok=True)
+            order.append(f"{name} ends")
+
+    second = threading.Thread(target=compile_it, args=("second", lambda: None))
+    compile_it("first", lambda: (second.start(), time.sleep(0.2)))
+    second.join()
+    compile_it("third", lambda: None)
+    parts = [(name, f"{name} ends") for name in ("first", "second", "third")]
+    found = ["compiles", "found", "found"]
+    assert order == [x for (name, end), what in zip(parts, found, strict=True) for x in (f"{name} begins, {what}", end)]
+    assert [path.name for path in tmp_path.iterdir()] == ["wp_made_up_1"]

@@ -12,6 +12,7 @@ and of others. CUDA does not work there once the parent has started it: an error
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 import os
@@ -163,7 +164,10 @@ def _load_here(kernel: wp.Kernel, device: wp.Device) -> None:
     cpu = time.thread_time()
     with loading.lock_of(kernel.module.name):
         loading.prepare(kernel.module)
-        kernel.module.load(device, 1 if device.is_cpu else CUDA_BLOCK)
+        block = 1 if device.is_cpu else CUDA_BLOCK
+        is_loaded = (kernel.module.name, device.alias) in _loaded
+        with contextlib.nullcontext() if is_loaded else loading.alone(kernel, block):
+            kernel.module.load(device, block)
     with _counting:
         compile_cpu_seconds += time.thread_time() - cpu
 

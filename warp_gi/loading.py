@@ -3,6 +3,9 @@
 A module compiles in seconds and without the interpreter's lock, so several compile side by side, and while the scene is
 loaded. Which thread loads a module decides nothing that a kernel computes. A fork waits until no thread is inside the
 compiler; the child has none of the threads and nothing in the queue, and loads what it launches by itself.
+
+Processes that share Warp's cache may compile one module at once: Warp builds it in a folder of the process and renames
+that to its place, so the cache is whole always. Here the second one waits for the first, and loads what that compiled.
 """
 
 from __future__ import annotations
@@ -13,11 +16,16 @@ import logging
 import math
 import os
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import warp as wp
+
+try:
+    import fcntl
+except ImportError:  # Windows: two processes may compile one module, as Warp has it
+    fcntl = None  # type: ignore[assignment]
 
 HEADER_SECONDS, MODULE_SECONDS = 1.5, 2.0
 """CPU seconds of Warp's header, once a thread, and of a module: for the estimate that a message gives."""
@@ -70,6 +78,26 @@ def uncached(kernels: Iterable[wp.Kernel]) -> list[wp.Kernel]:
     """Return the kernels whose modules have no folder in Warp's cache, and so have to be compiled for the CPU."""
     folder = Path(wp.config.kernel_cache_dir or "")
     return [one for one in kernels if not (folder / one.module.get_module_identifier(1)).is_dir()]
+
+
+@contextlib.contextmanager
+def alone(kernel: wp.Kernel, block: int) -> Iterator[None]:
+    """Keep other processes from compiling a module, for ``block`` threads a block, that is not in Warp's cache yet.
+
+    Where files cannot be locked nothing is kept from anyone.
+    """
+    folder, is_ours = Path(wp.config.kernel_cache_dir or ""), kernel.module.name.startswith(_PACKAGE)
+    name = kernel.module.get_module_identifier(block) if is_ours else ""
+    if fcntl is None or not name or not folder.is_dir() or (folder / name).is_dir():
+        yield
+        return
+    path = folder / f".{name}.compiling"
+    with contextlib.ExitStack() as held:
+        with contextlib.suppress(OSError):  # a read-only cache, or a disk without locks
+            file = held.enter_context(open(path, "ab"))
+            fcntl.flock(file, fcntl.LOCK_EX)  # the system lets go of it however the process ends
+        yield
+        path.unlink(missing_ok=True)  # who waits for it has it open
 
 
 def load_ahead(kernels: Iterable[wp.Kernel], load: Callable[[wp.Kernel], None], threads: int) -> None:

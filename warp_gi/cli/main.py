@@ -36,6 +36,7 @@ COMMANDS = {
     "render": Command("warp_gi.cli.render", "render a sequence of frames to EXR files, with PNG previews"),
     "bake": Command("warp_gi.cli.bake", "compute once what an estimator needs, and save it"),
     "compare": Command("warp_gi.cli.compare", "measure how far a picture is from its reference"),
+    "video": Command("warp_gi.cli.video", "make a film of the frames of a sequence"),
     "info": Command("warp_gi.cli.info", "print what a scene holds"),
     "bench": Command("warp_gi.cli.bench", "run a benchmark suite"),
 }

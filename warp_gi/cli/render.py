@@ -40,6 +40,7 @@ from warp_gi.sequence.chunks import chunk_of, run_of
 from warp_gi.sequence.frame_time import parse_seconds, take_time
 from warp_gi.sequence.frames import parse_frames
 from warp_gi.sequence.resume import Output, Plan, SequenceRun, Shot, shots_of
+from warp_gi.sequence.video import Video, check_video
 
 DESCRIPTION = """Render a sequence of frames to EXR files with named layers, and PNG previews.
 
@@ -104,6 +105,8 @@ class Render(SceneOptions):
     """Write a tone-mapped PNG beside each frame."""
     exposure: float = 0.0
     """Exposure of previews in stops."""
+    video: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Make a film of the frames when all are there: the files' name without number, .mp4, with EXPOSURE."""
     cache: bool = True
     """Keep bakes that take long, and use them the next time: in the folder WARP_GI_BAKES, or warp_gi/bakes in
     XDG_CACHE_HOME or ~/.cache, at most 2 GiB. Frames are the same."""
@@ -151,6 +154,10 @@ def run(options: Render, report: Reporter) -> None:
     chunk = chunk_of(options.chunk, options.warm_up, frame_time)
     if options.cluster and (chunk or frame_time or options.reuse_pictures):
         raise OptionError("--cluster goes without --chunk, --frame-time and --reuse-pictures; leave them out")
+    if options.video:
+        if chunk is not None:
+            raise OptionError("--video needs all frames, and a chunk has some; run warp-gi video when all are there")
+        check_video(options.output)
     output = find_output(options)
     check_targets(options)
     bakes = [load_bake(path) for path in options.bake]
@@ -209,6 +216,11 @@ def run(options: Render, report: Reporter) -> None:
         report.line(f"chunk {options.chunk} has no frame: there are {len(shots)} in all")
     count = f"{len(plan.todo)} frame{'s' * (len(plan.todo) != 1)}"
     report.line(f"{count} in {time.perf_counter() - started:.1f} s: {options.output}")
+    if options.video:
+        film = Video(options.output, None, [shot.index for shot in shots], None, options.exposure * output.is_exr)
+        with report.shares("video") as tell:
+            film.write(tell)
+        report.line(f"film: {film.output}")
     if options.verbose and times:
         times["bake"] = times["bake"][:1]  # every frame names the one bake
         rows = [(stage, *(f"{x:.3f}" for x in (v[0], sum(v) / len(v), max(v), sum(v)))) for stage, v in times.items()]

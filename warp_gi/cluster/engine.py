@@ -14,7 +14,7 @@ import time
 import uuid
 import warnings
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -30,6 +30,8 @@ from warp_gi.sequence.resume import Plan, SequenceRun
 
 ANSWER_SECONDS = 10.0
 """Seconds for which a scheduler is waited for."""
+PATIENCE_SECONDS = 120.0
+"""Seconds for which workers are asked again, if one after another dies meanwhile."""
 LOOK_SECONDS = 2.0
 """Seconds between two looks at which workers there are."""
 _LOG = logging.getLogger("warp_gi")
@@ -116,6 +118,11 @@ class Cluster:
         self._refused: set[str] = set()
         self._looked = -LOOK_SECONDS
         self._said_none = False
+        self._waiting: deque[int] = deque()
+        self._flying: dict[str, tuple[int, Any]] = {}
+        self._finished: queue.Queue[Any] = queue.Queue()
+        self._shared: Any = None
+        self._tries = 0
 
     def render(self, places: Sequence[int]) -> Iterator[Any]:
         """Yield a ``Done`` for each frame, as they come; frames that depend on those before are rendered one by one.
@@ -123,36 +130,59 @@ class Cluster:
         Raises OptionError for a frame that no worker can render, OSError for one that failed, or if the scheduler goes
         away: finished frames stay in their files.
         """
-        from warp_gi.cluster.worker import Admission, render_place, same
+        from warp_gi.cluster.worker import Admission
 
-        client, resource = self.client, self.job.identity.resource
-        client.register_plugin(Admission(self.job.identity))
-        self.look()
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Sending large graph")  # a scene, once
-            job = client.submit(same, self.job, key=f"{self.job.name}-job", resources={resource: 1e-3})
-        waiting = deque(places)
-        flying: dict[str, tuple[int, Any]] = {}
-        finished: queue.Queue[Any] = queue.Queue()
+        self._ask(lambda: self.client.register_plugin(Admission(self.job.identity)))
+        self._waiting = deque(places)
         try:
-            while waiting or flying:
-                while waiting and len(flying) < self.most_at_once:
-                    place = waiting.popleft()
-                    name = f"{self.job.name}-{self.job.frames[place]}"
-                    future = client.submit(render_place, job, place, key=name, resources={resource: 1})
-                    flying[future.key] = place, future
-                    future.add_done_callback(finished.put)
-                try:
-                    future = finished.get(timeout=LOOK_SECONDS)
-                except queue.Empty:
-                    self.look()
-                    continue
-                place, _ = flying.pop(future.key)
-                yield self._result(future, place)
+            self.look()
+            self._send_job()
+            while self._waiting or self._flying:
+                while self._waiting and len(self._flying) < self.most_at_once:
+                    self._send(self._waiting.popleft())
+                with contextlib.suppress(queue.Empty):
+                    future = self._finished.get(timeout=LOOK_SECONDS)
+                    done = self._result(future) if future.key in self._flying else None
+                    if done is not None:
+                        del self._flying[future.key]
+                        yield done
                 self.look()
         finally:
-            with contextlib.suppress(Exception):  # the scheduler may have gone
-                client.cancel([job, *(future for _, future in flying.values())], force=True)
+            if self.client.status == "running":  # the scheduler has not gone
+                self.client.cancel([self._shared, *(future for _, future in self._flying.values())], force=True)
+
+    def _send_job(self) -> None:
+        from warp_gi.cluster.worker import same
+
+        self._tries += 1
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Sending large graph")  # a scene, once
+            name = f"{self.job.name}-job-{self._tries}"
+            self._shared = self.client.submit(same, self.job, key=name, resources={self.job.identity.resource: 1e-3})
+
+    def _send(self, place: int) -> None:
+        from warp_gi.cluster.worker import render_place
+
+        name = f"{self.job.name}-{self.job.frames[place]}-{self._tries}"
+        resources = {self.job.identity.resource: 1}
+        future = self.client.submit(render_place, self._shared, place, key=name, resources=resources)
+        self._flying[future.key] = place, future
+        future.add_done_callback(self._finished.put)
+
+    def _send_again(self) -> None:
+        """Send frames anew that no worker has, though there are some.
+
+        Dask asks for a task's resource when a worker comes, which has it a moment later: a task that had to wait for a
+        worker, as all had died, would wait for ever.
+        """
+        taken = {key for keys in self._ask(self.client.processing).values() for key in keys}
+        lost = [key for key, (_, future) in self._flying.items() if key not in taken and future.status == "pending"]
+        if not lost or not self.workers or self._shared.key in taken:
+            return
+        dropped = [self._flying.pop(key) for key in lost]
+        self._waiting.extendleft(place for place, _ in reversed(dropped))
+        self.client.cancel([future for _, future in dropped], force=True)
+        self._send_job()
 
     @property
     def most_at_once(self) -> int:
@@ -163,15 +193,16 @@ class Cluster:
         """See which workers there are, not more often than every 2 s; a line names those that cannot be used."""
         if time.monotonic() - self._looked < LOOK_SECONDS:
             return
-        try:
-            known = set(self.client.scheduler_info(n_workers=-1)["workers"])
-            fresh = sorted(known - self.workers - self._refused)
-            told = self.client.run(Identity.mine, workers=fresh, on_error="return") if fresh else {}
-        except (OSError, TimeoutError) as error:
-            raise self._gone() from error
+        known = set(self._ask(lambda: self.client.scheduler_info(n_workers=-1)["workers"]))
+        fresh = sorted(known - self.workers - self._refused)
+        told: dict[str, Any] = {}
+        if fresh:
+            told = self._ask(lambda: self.client.run(Identity.mine, workers=fresh, on_error="return"))
         self._looked = time.monotonic()
         self.workers &= known
         for address, found in told.items():
+            if isinstance(found, OSError | TimeoutError):  # it has just died
+                continue
             if isinstance(found, Identity):
                 problem = self.job.identity.differences(found)
             else:
@@ -179,9 +210,29 @@ class Cluster:
             (self._refused if problem else self.workers).add(address)
             if problem:
                 _LOG.info("worker %s is not used: it has %s", address, problem)
+        if self._flying:
+            self._send_again()
         if not self.workers and not self._said_none:
             self._said_none = True
             _LOG.info("no worker that can render is there; waiting for one (dask worker %s)", self._address)
+
+    def _ask(self, call: Callable[[], Any]) -> Any:
+        """Return what a call returns, again if a worker dies meanwhile; raises OSError if the scheduler is gone."""
+        began = connected = time.monotonic()
+        while True:
+            problem = ""
+            try:
+                if self.client.status == "running":
+                    connected = time.monotonic()
+                    return call()
+            except (OSError, TimeoutError) as error:  # also of a worker that dies while it is asked
+                problem = one_line(error, type(error).__name__)
+            now = time.monotonic()
+            if self.client.status == "closed" or (not problem and now - connected > ANSWER_SECONDS):
+                raise self._gone()
+            if now - began > PATIENCE_SECONDS:
+                raise OSError(f"the Dask scheduler's workers cannot be asked ({problem}); finished frames are kept")
+            time.sleep(0.1)
 
     @property
     def _address(self) -> str:
@@ -190,10 +241,20 @@ class Cluster:
     def _gone(self) -> OSError:
         return OSError("the Dask scheduler has gone; finished frames are kept, --resume renders the others")
 
-    def _result(self, future: Any, place: int) -> Any:
-        frame = self.job.frames[place]
+    def _result(self, future: Any) -> Any:
+        """Return what a worker said of a frame; None if it died before it was asked, and another one is at it.
+
+        Raises OptionError or OSError for a frame that failed.
+        """
+        frame = self.job.frames[self._flying[future.key][0]]
         if future.status == "finished":
-            done = future.result()
+            try:
+                done = future.result(timeout=LOOK_SECONDS)
+            except TimeoutError:
+                done = None
+            if done is None:
+                future.add_done_callback(self._finished.put)
+                return None
             if not done.problem:
                 return done
             told = f"frame {frame} failed on worker {done.worker} ({done.host}): {done.problem}"
@@ -207,7 +268,10 @@ class Cluster:
                     "enough memory?"
                 )
             raise OSError(f"frame {frame} failed: {type(error).__name__}: {one_line(error)}")
-        raise self._gone()
+        if future.status == "cancelled":
+            raise self._gone()
+        future.add_done_callback(self._finished.put)
+        return None
 
 
 def frames_on(cluster: object, run: SequenceRun, plan: Plan, job: Job) -> Iterator[FrameFile]:
