@@ -123,7 +123,9 @@ class BakeFolder:
                 bake.save(path)
                 prune(self.folder, f"?*-{'[0-9a-f]' * DIGITS}{_SUFFIX}", self.most_bytes, path)
         except (OSError, BakeError, TypeError) as error:  # TypeError: a value that a file does not hold
-            _LOG.info("the bake cannot be kept for the next time: %s", one_line(str(error)))
+            _LOG.info(
+                "the bake cannot be kept for the next time: %s; %s names another folder", one_line(str(error)), VARIABLE
+            )
 
 
 def cached_bake(

@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 import numpy as np
 import warp as wp
 
-from warp_gi import forks, loading, workers
+from warp_gi import forks, kernel_cache, loading, workers
 from warp_gi.errors import OptionError
 from warp_gi.verbosity import quieten_warp
 
@@ -86,8 +86,10 @@ def _checked_threads(value: object) -> int:
 def get_device(name: str | None) -> wp.Device:
     """Return the Warp device of that name ("cpu", "cuda", "cuda:1").
 
-    Raises OptionError if it is not there, or is CUDA in a process forked after CUDA had started.
+    Raises OptionError if it is not there, or is CUDA in a process forked after CUDA had started; OSError that names the
+    folder of compiled kernels if that cannot be made.
     """
+    kernel_cache.start()
     try:
         if name and name.startswith("cuda") and not wp.is_cuda_available():  # Warp would print before it raises
             raise RuntimeError("Warp finds no CUDA driver or GPU")
@@ -167,7 +169,7 @@ def _load_here(kernel: wp.Kernel, device: wp.Device) -> None:
         block = 1 if device.is_cpu else CUDA_BLOCK
         is_loaded = (kernel.module.name, device.alias) in _loaded
         with contextlib.nullcontext() if is_loaded else loading.alone(kernel, block):
-            kernel.module.load(device, block)
+            kernel_cache.load(kernel.module, device, block)
     with _counting:
         compile_cpu_seconds += time.thread_time() - cpu
 

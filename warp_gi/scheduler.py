@@ -30,7 +30,7 @@ from warp_gi.scene.camera import Camera, CameraPath, frame_time, warn_if_far
 from warp_gi.scene.device_scene import Trail
 from warp_gi.scene.scene import Scene
 from warp_gi.scene.sky_motion import sky_start
-from warp_gi.sequence.state import Dependence, state_arrays, with_arrays
+from warp_gi.sequence.state import Dependence, loaded_states, state_arrays
 from warp_gi.stateful import Ahead, Stateful
 
 _Arguments = ParamSpec("_Arguments")
@@ -373,8 +373,8 @@ class FrameScheduler:
         saved, wanted = load_bake(path), self._saved_state(lineage, {})
         try:
             saved.check(wanted.technique, wanted.scene_key, wanted.settings, wanted.scene_name)
-            self._states = self._states | with_arrays(self._to_save(), saved.arrays, self.device)
-        except (BakeError, KeyError, ValueError, RuntimeError) as error:
+            self._states = self._states | loaded_states(self._to_save(), saved.arrays, self.device)
+        except ValueError as error:
             raise BakeError(f"{path}: is not the state of this sequence ({error}); delete it") from error
 
     def _to_save(self) -> dict[str, Any]:

@@ -190,18 +190,20 @@ def test_many_large_textures_stay_in_bounds():
     assert len(grids.cells) <= emission_grids.MOST_CELLS and (grids.table["side"] > 0).sum() > 24
 
 
-def test_a_texture_edited_before_the_first_picture_is_the_one_that_is_sampled():
+def test_a_texture_edited_before_the_first_picture_and_after_is_the_one_that_is_sampled():
     pixels = image("texel")
     mesh = panel(pixels, wrap=CLAMP, emission=4096.0)
     scene = gi.Scene([gi.Node("floor", [floor()]), gi.Node("panel", [mesh])])
     scene.emitter_powers()
     pixels[..., :3] = np.roll(pixels[..., :3], (5, -11), axis=(0, 1))
     camera = gi.Camera.look_at((0, 0.5, 0.001), (0, 0, 0), hfov=0.01, resolution=(16, 16))
-    frame = next(iter(gi.render(scene, camera, gi.Pipeline.preset("direct", spp=64)))).numpy("beauty")
-    assert frame.mean(axis=(0, 1)) == pytest.approx(reflected(mesh), rel=0.01)
-    pixels[..., :3] = np.roll(pixels[..., :3], 9, axis=1)
-    with pytest.raises(gi.SceneError, match="changed"):
-        scene.check_unchanged()
+    seen = []
+    for _ in range(2):
+        frame = next(iter(gi.render(scene, camera, gi.Pipeline.preset("direct", spp=64)))).numpy("beauty")
+        seen.append(reflected(mesh))
+        assert frame.mean(axis=(0, 1)) == pytest.approx(seen[-1], rel=0.01)
+        pixels[..., :3] = np.roll(pixels[..., :3], 9, axis=1)
+    assert not np.allclose(*seen, rtol=0.05)
 
 
 def test_materials_that_share_a_texture_share_its_sums(monkeypatch):

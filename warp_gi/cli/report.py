@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol, TypeVar
 
 import warp as wp
 
-from warp_gi import launch
+from warp_gi import kernel_cache, launch
 
 LINE_SECONDS = 10.0
 RECENT = 8
@@ -282,7 +282,7 @@ def start_warp(device: str = "cpu", threads: int | None = None) -> None:
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)  # native code writes there by itself
-        wp.init()
+        kernel_cache.start()
     finally:
         os.dup2(kept, 2)
         os.close(kept)

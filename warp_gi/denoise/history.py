@@ -11,12 +11,17 @@ import warp as wp
 
 from warp_gi import launch
 from warp_gi.kernels import denoise
+from warp_gi.layout import Layout, misfit
 from warp_gi.scene.hashing import light_of
 
 if TYPE_CHECKING:
     from warp_gi.frame import Frame
     from warp_gi.scene.baked import BakedScene
     from warp_gi.scene.scene import Scene
+
+
+MOST = 1e30
+"""Largest radiance of a saved state."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +87,24 @@ class History:
         light = arrays["light"].tobytes().decode("ascii")
         return History(index, (size[0], size[1]), (self.scene[0], light), guides, average, apart, picture)
 
+    def fault(self, before: History, states: Mapping[str, Any]) -> str:
+        """Return why a state that was read from a file cannot be; "" if it can."""
+        width, height = self.resolution
+        if not (-1 <= self.index < 1 << 31 and 0 <= width < 1 << 20 and 0 <= height < 1 << 20):
+            return f"its last frame is {self.index} of {width}x{height}"
+        signals = {name: getattr(self.average, name).numpy() for name in launch.fields_of(denoise.Signals)}
+        layouts = {name: Layout("float32", np.shape(values), -MOST, MOST) for name, values in signals.items()}
+        layouts["length"] = Layout("float32", np.shape(signals["length"]), 0, 1 << 20)
+        apart = None if self.apart is None else self.apart.average
+        for name, values in (("picture", self.picture), ("apart", apart)):
+            if values is not None:
+                signals[name] = values.numpy()
+                layouts[name] = Layout("float32", np.shape(signals[name]), -MOST, MOST)
+        if self.apart is not None:
+            signals["apart_directions"] = self.apart.directions
+            layouts["apart_directions"] = Layout("float64", (None, 3), -1.001, 1.001)
+        return misfit(signals, layouts)
+
     def leads_to(self, frame: Frame) -> bool:
         """Return whether the frame's motion is towards the last frame, of the same scene and size."""
         return (
@@ -119,6 +142,7 @@ def _empty(struct: type[launch.Struct], device: wp.Device) -> launch.Struct:
 
 def _loaded(array: np.ndarray, dtype: type, count: int, device: wp.Device) -> wp.array:
     """Return an array on a device; raises ValueError unless it has ``count`` items."""
-    if len(array) != count:
-        raise ValueError(f"{len(array)} pixels instead of {count}")
+    kind = wp.empty(1, dtype=dtype, device="cpu").numpy()
+    if array.dtype != kind.dtype or array.shape != (count, *kind.shape[1:]):
+        raise ValueError(f"an array of {count} pixels is {array.dtype} {list(array.shape)}, expected {kind.dtype}")
     return wp.array(array, dtype=dtype, device=device)

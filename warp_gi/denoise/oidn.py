@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -64,6 +65,10 @@ class OidnState:
     """The module of Open Image Denoise."""
     history: History
     """What it keeps of the last frame, if it accumulates."""
+
+    def fault(self, before: OidnState, states: Mapping[str, Any]) -> str:
+        """Return why a state that was read from a file cannot be; "" if it can."""
+        return self.history.fault(before.history, states)
 
 
 @dataclass(frozen=True)

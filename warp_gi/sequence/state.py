@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import warp as wp
 
+from warp_gi.errors import one_line
 from warp_gi.launch import copied
 
 
@@ -58,11 +59,10 @@ def with_arrays(state: Any, arrays: Mapping[str, np.ndarray], device: wp.Device,
     Raises KeyError where ``arrays`` lacks one, ValueError where its items do not fit.
     """
     if isinstance(state, wp.array):
-        restored: wp.array = wp.array(arrays[name], dtype=state.dtype, device=device)
-        if restored.ndim != state.ndim:
-            raise ValueError(f"{name} has {arrays[name].ndim} dimensions")
-        return restored
+        return wp.array(_fitting(arrays[name], state, name), dtype=state.dtype, device=device)
     if isinstance(state, np.ndarray):
+        if arrays[name].dtype != state.dtype or arrays[name].ndim != state.ndim:
+            raise ValueError(f"{name} is {arrays[name].dtype} {list(arrays[name].shape)}, expected {state.dtype}")
         return arrays[name]
     if hasattr(state, "with_saved_arrays"):
         prefix = f"{name}."
@@ -79,6 +79,33 @@ def with_arrays(state: Any, arrays: Mapping[str, np.ndarray], device: wp.Device,
             setattr(struct, key, value)
         return struct
     return state
+
+
+def loaded_states(before: Mapping[str, Any], arrays: Mapping[str, np.ndarray], device: wp.Device) -> dict[str, Any]:
+    """Return states like those ``before`` the first frame, with the arrays of a file that says it is of their kind.
+
+    The file may be forged: arrays have the types and shapes of what they replace, and states with a method ``fault``
+    say what else is wrong before a kernel follows an index. Raises ValueError where one cannot be.
+    """
+    try:
+        with np.errstate(all="ignore"):
+            states: dict[str, Any] = with_arrays(before, arrays, device)
+            for place, state in states.items():
+                if hasattr(state, "fault") and (problem := state.fault(before[place], states)):
+                    raise ValueError(f"{place}: {problem}")
+    except KeyError as error:
+        raise ValueError(f"it has no array {error}") from error
+    except (ValueError, TypeError, IndexError, AttributeError, OverflowError, RuntimeError, MemoryError) as error:
+        raise ValueError(one_line(error, type(error).__name__)) from error
+    return states
+
+
+def _fitting(array: np.ndarray, like: wp.array, name: str) -> np.ndarray:
+    """Return an array of a file; raises ValueError unless it has the type and the rank of what it replaces."""
+    kind = like.numpy()
+    if array.dtype != kind.dtype or array.ndim != kind.ndim or array.shape[like.ndim :] != kind.shape[like.ndim :]:
+        raise ValueError(f"{name} is {array.dtype} {list(array.shape)}, expected {kind.dtype} as {list(kind.shape)}")
+    return array
 
 
 def _parts(state: Any) -> Iterator[tuple[str, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -14,6 +15,7 @@ from warp_gi.kernels.reuse_gains import sum_gains
 from warp_gi.techniques.paths.estimators import BsdfPaths
 from warp_gi.techniques.reuse.rest import GUIDE_COST, Rest, rest_after, wish_for_lesson, woken_by
 from warp_gi.techniques.reuse.sample_octree import Lesson, SampleOctree
+from warp_gi.techniques.reuse.saved import guide_fault
 
 if TYPE_CHECKING:
     from warp_gi.baking import Bake
@@ -189,6 +191,10 @@ class GuideState:
     """uint32 [leaf * bits / 4]: numbers of leaves below nodes of the quadtrees, which follow from the trees."""
     rest: Rest = field(default_factory=Rest)
     """Whether frames use the quadtrees."""
+
+    def fault(self, before: GuideState, states: Mapping[str, Any]) -> str:
+        """Return why a state that was read from a file cannot be; "" if it can."""
+        return guide_fault(self, before, states.get(SampleOctree.name))
 
 
 def _guides(leaves: int, bits: int, device: wp.Device) -> guided_shares.GuideKnowledge:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -25,6 +26,7 @@ from warp_gi.techniques.light_hierarchy.estimator import (
 )
 from warp_gi.techniques.reuse.rest import CACHE_COST, Rest, rest_after, wish_for_lesson, woken_by
 from warp_gi.techniques.reuse.sample_octree import Lesson, SampleOctree, running_sums
+from warp_gi.techniques.reuse.saved import cache_fault
 from warp_gi.techniques.shared.ltc import ltc_table
 
 if TYPE_CHECKING:
@@ -305,6 +307,10 @@ class CacheState:
     """Emitter [emitter]: lights of the scene in this frame; None before the first frame."""
     rest: Rest = field(default_factory=Rest)
     """Whether frames use the caches."""
+
+    def fault(self, before: CacheState, states: Mapping[str, Any]) -> str:
+        """Return why a state that was read from a file cannot be; "" if it can."""
+        return cache_fault(self, before, states.get(SampleOctree.name))
 
 
 def _lists(leaves: int, device: wp.Device) -> light_cache_build.LightLists:

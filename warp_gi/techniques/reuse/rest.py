@@ -39,6 +39,7 @@ WAKING = 96
 """Frames of rest that allow for a trial ahead of time, when lights begin to move; the first is given."""
 LEARNING_FADING, FADING = 0.5, 0.95
 """Share of sums that stays from frame to frame: in a trial in which gains grow, and else."""
+MOST_NUMBER = 1e18  # of a saved state
 MOST_GAIN, MOST_LOSS = 2.0, 10.0
 """Largest gain and loss that one frame tells of, over the variance of its picture: what samples say that the picture
 does not show would be a few bright pixels in a hundred frames."""
@@ -166,6 +167,9 @@ class Rest:
     def with_saved_arrays(self, arrays: Mapping[str, np.ndarray]) -> Rest:
         """Return the rest of a saved state."""
         kinds = (type(getattr(self, one.name)) for one in fields(self))
+        numbers = arrays["numbers"]
+        if numbers.shape != (len(fields(self)),) or not (np.abs(numbers) < MOST_NUMBER).all():
+            raise ValueError(f"{numbers!r:.200} are not the numbers of a rest")
         return Rest(*(kind(value) for kind, value in zip(kinds, arrays["numbers"], strict=True)))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -15,6 +15,7 @@ from warp_gi.kernels import octree as octree_kernels
 from warp_gi.kernels import samples as sample_kernels
 from warp_gi.scene.baked import whole_scene
 from warp_gi.stateful import Service
+from warp_gi.techniques.reuse.saved import octree_fault
 
 if TYPE_CHECKING:
     from warp_gi.baking import Bake
@@ -238,6 +239,10 @@ class OctreeState:
     """bool: whether lights moved in the last frame."""
     spare: SpareRecords = field(default_factory=SpareRecords, metadata={"derived": True})
     """Buffers for the next frame's samples, if the last frame left any."""
+
+    def fault(self, before: OctreeState, states: Mapping[str, Any]) -> str:
+        """Return why a state that was read from a file cannot be; "" if it can."""
+        return octree_fault(self)
 
     @property
     def leaf_count(self) -> int:

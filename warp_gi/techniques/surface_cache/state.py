@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from warp_gi import launch
 from warp_gi.color import LUMINANCE
 from warp_gi.frame import Frame
 from warp_gi.kernels.surface_cache import SurfaceCells
+from warp_gi.layout import Layout, misfit
 from warp_gi.scene.baked import BakedScene, whole_scene
 from warp_gi.techniques.surface_cache.cells import NOTHING, Sums, coarser
 from warp_gi.techniques.surface_cache.fill import (
@@ -61,6 +63,19 @@ class CacheState:
     """Number of the frame that the cells are of, int64 [1]; -1 before the first one."""
     tabled: np.ndarray | None = field(default=None, metadata={"derived": True})
     """The array ``keys`` that the table of ``cells`` is of: another one in a state that was loaded from a file."""
+
+    def fault(self, before: CacheState, states: Mapping[str, Any]) -> str:
+        """Return why a state that was read from a file cannot be; "" if it can."""
+        count, most = len(self.keys), 1e37
+        layouts = {
+            "keys": Layout("uint64", (count,), 1),
+            "light": Layout("float64", (count, 7), -most, most),
+            "weights": Layout("float64", (count,), 1e-30, most),
+            "frame": Layout("int64", (1,), -1, 1 << 31),
+        }
+        arrays = {name: getattr(self, name) for name in layouts}
+        problem = misfit(arrays, layouts)
+        return problem or ("its keys are not in order" if (self.keys[1:] <= self.keys[:-1]).any() else "")
 
 
 @dataclass(frozen=True)

@@ -197,6 +197,7 @@ class FieldState:
         if arrays["start"].tobytes() != self._start_digest():
             raise ValueError("the field began with other cells")
         wanted = self.layout(arrays["cells"].shape[:1]) | self.layout(arrays["settled_cells"].shape[:1], "settled_")
+        wanted["poses"] = Layout("float64", np.shape(arrays["poses"]))
         if problem := misfit(arrays, wanted):
             raise ValueError(problem)
         state, count = self.copied(), self._start_count
