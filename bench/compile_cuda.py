@@ -42,7 +42,10 @@ def kernel_modules() -> list[str]:
 
 
 def every_tracer() -> list[PathTracer]:
-    """Return the path tracers of the registry: each light sampler with each direction sampler, and each hook once."""
+    """Return the path tracers of the registry: each light sampler with each direction sampler, and each hook once.
+
+    And one with coloured glass.
+    """
     found = registry.samplers().values()
     lights = [one for one in found if isinstance(one, LightSampler)]
     directions = [one for one in found if isinstance(one, DirectionSampler)]
@@ -53,7 +56,8 @@ def every_tracer() -> list[PathTracer]:
     plain = [path_tracer(*pair, region) for pair, region in zip(pairs, regions, strict=True)]
     hooks = [(SCENE_SKY, one) for one in found if isinstance(one, PathCache)]
     hooks += [(one, NO_CACHE) for one in found if isinstance(one, Sky)]
-    return plain + [path_tracer(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, sky, cache) for sky, cache in hooks]
+    hooked = [path_tracer(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, sky, cache) for sky, cache in hooks]
+    return [*plain, *hooked, path_tracer(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, tints=True)]
 
 
 def compile_module(name: str, architectures: Sequence[int], folder: Path) -> list[Path]:

@@ -51,15 +51,15 @@ class Layers:
     v: wp.float32
 
 
-# The sums with a layer that stops some share of the ray.
+# The sums with a layer that stops some share of the ray. What denoisers divide by has the tint that the light has, too.
 @wp.func
 def with_layer(
     layers: Layers, scene: SceneData, hit: BvhHit, s: Surface, direction: wp.vec3, share: wp.float32
 ) -> Layers:
     r = layers
     r.left = wp.max(r.left - share, 0.0)
-    r.diffuse = r.diffuse + s.bsdf.diffuse * share
-    r.specular = r.specular + average_specular(s.bsdf) * share
+    r.diffuse = r.diffuse + wp.cw_mul(s.bsdf.diffuse, r.tint) * share
+    r.specular = r.specular + wp.cw_mul(average_specular(s.bsdf), r.tint) * share
     r.albedo = r.albedo + s.base_color * share
     r.normal = r.normal + shading_normal(s) * share
     r.emission = r.emission + wp.cw_mul(surface_emission(scene, hit.face, hit.u, hit.v, -direction), r.tint) * share
@@ -124,7 +124,7 @@ def albedo_ratio(drawn: wp.vec3, mean: wp.vec3) -> wp.vec3:
 
 
 # Thread: a pixel. As gbuffer.shade_primary, for means over layers; what is of one surface is that of the layer with the
-# largest share. `ratios`, where wanted, is what the denoiser's diffuse light of this camera sample is multiplied with.
+# largest share. `emission` is that of this camera sample alone, of which moments of its light are made.
 @wp.kernel
 def shade_layers(
     first: wp.int32,
@@ -134,6 +134,7 @@ def shade_layers(
     settings: PassSettings,
     hits: PrimaryHits,
     buffers: SurfaceBuffers,
+    emission: wp.array(dtype=wp.vec3),
 ):
     pixel = first + wp.tid()
     direction = hits.direction[pixel]
@@ -141,7 +142,8 @@ def shade_layers(
     origin = camera_origin(camera, at[0], at[1])
     r = layers_along(scene, origin, direction)
     sky = environment_radiance(scene.environment, direction)
-    buffers.emission[pixel] = buffers.emission[pixel] + r.emission + wp.cw_mul(sky, r.tint) * r.left
+    emission[pixel] = r.emission + wp.cw_mul(sky, r.tint) * r.left
+    buffers.emission[pixel] = buffers.emission[pixel] + emission[pixel]
     buffers.alpha[pixel] = buffers.alpha[pixel] + 1.0 - r.left
     buffers.albedo[pixel] = buffers.albedo[pixel] + r.albedo
     buffers.normal[pixel] = buffers.normal[pixel] + r.normal

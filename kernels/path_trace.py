@@ -123,6 +123,17 @@ def tint_before(scene: SceneData, position: wp.vec3, direction: wp.vec3, t: wp.f
     return glass_tint(scene, position - direction * t, direction, t)
 
 
+# The same where there is no coloured glass.
+@wp.func
+def no_tint(scene: SceneData, position: wp.vec3, direction: wp.vec3, t: wp.float32) -> wp.vec3:
+    return wp.vec3(1.0, 1.0, 1.0)
+
+
+@wp.func
+def untinted(radiance: PathRadiance, scene: SceneData, tint: wp.vec3) -> PathRadiance:
+    return radiance
+
+
 # The radiance of a path whose first vertex is seen through coloured glass.
 @wp.func
 def tinted(radiance: PathRadiance, scene: SceneData, tint: wp.vec3) -> PathRadiance:
@@ -149,6 +160,22 @@ class PathBuffers:
     lobe_apart: wp.array(dtype=wp.vec3)
     moment1: wp.array(dtype=wp.vec3)  # of the samples of beauty
     moment2: wp.array(dtype=wp.vec3)  # of their squares
+    layer_emission: wp.array(dtype=wp.vec3)  # of this camera sample, as a mean over its layers; or empty
+
+
+# The emission of the layers of a camera ray, or else that of what it met.
+@wp.func
+def of_layers(buffers: PathBuffers, pixel: wp.int32, drawn: wp.vec3) -> wp.vec3:
+    if buffers.layer_emission.shape[0] > 0:
+        return buffers.layer_emission[pixel]
+    return drawn
+
+
+# Adds the moments of equal samples of beauty.
+@wp.func
+def add_moments(buffers: PathBuffers, pixel: wp.int32, beauty: wp.vec3, count: wp.float32):
+    buffers.moment1[pixel] = buffers.moment1[pixel] + beauty * count
+    buffers.moment2[pixel] = buffers.moment2[pixel] + wp.cw_mul(beauty, beauty) * count
 
 
 # Adds the light of a path, parted by lobes: diffuse light as it comes in.
@@ -177,31 +204,35 @@ def path_tracer(
     regions: Regions,
     sky: Sky = SCENE_SKY,
     cache: PathCache = NO_CACHE,
+    tints: bool = False,
 ) -> PathTracer:
     """Return the path tracer that uses these samplers, this sky and this radiance cache; made once.
 
     The regions follow from the samplers (``uses_regions``). Nothing is compiled of a cache that is NO_CACHE, nor of
-    records that SCENE_SKY does not keep.
+    records that SCENE_SKY does not keep. ``tints`` is whether the scene may have panes of coloured glass: the code for
+    them costs paths that meet none 1 % of their time, and every module a fifth of its compilation.
     """
-    return _made(lights, directions, regions, sky, cache)
+    return _made(lights, directions, regions, sky, cache, tints)
 
 
-def _module_name(lights: LightSampler, directions: DirectionSampler, sky: Sky, cache: PathCache) -> str:
+def _module_name(lights: LightSampler, directions: DirectionSampler, sky: Sky, cache: PathCache, tints: bool) -> str:
     """Return the name of a tracer's Warp module: by its samplers, and the hooks that are in use."""
     hooks = [f"sky_{sky.name}"] if sky is not SCENE_SKY else []
     hooks += [f"cache_{cache.name}"] if cache is not NO_CACHE else []
+    hooks += ["tints"] if tints else []
     return "_".join([f"{__name__}.{lights.name}", directions.name, *hooks])
 
 
 @functools.cache
 def _made(
-    lights: LightSampler, directions: DirectionSampler, regions: Regions, sky: Sky, cache: PathCache
+    lights: LightSampler, directions: DirectionSampler, regions: Regions, sky: Sky, cache: PathCache, tints: bool
 ) -> PathTracer:
     light_data, direction_data, region_data = lights.data, directions.data, regions.data
     holds_direct, lobe_probability = cache.holds_direct, cache.lobe or no_lobe
     sky_data, cache_data, has_cache = sky.data, cache.data, cache is not NO_CACHE
     apart, parts_lights = sky.apart, sky.apart is not None
     shades_late = cache.by_place and regions is NO_REGIONS
+    first_tint, with_tint = (tint_before, tinted) if tints else (no_tint, untinted)
     explore, choices = (no_light, 1) if lights.explore is None else (lights.explore, 2)
 
     @wp.struct
@@ -360,9 +391,10 @@ def _made(
                         beam = apart.sample(samplers.sky, scene, ray_origin(s), k, u_apart)
                         ray = connect_light(scene, s, wo, ray_origin(s), beam)
                         if ray.arrives > 0:
-                            if has_panes(scene.panes):
-                                tint = glass_tint(scene, ray_origin(s), ray.direction, ray.distance)
-                                ray.reflected = wp.cw_mul(ray.reflected, tint)
+                            if tints:
+                                if has_panes(scene.panes):
+                                    tint = glass_tint(scene, ray_origin(s), ray.direction, ray.distance)
+                                    ray.reflected = wp.cw_mul(ray.reflected, tint)
                             part = diffuse_part(s.bsdf, wo, wp.transpose(s.shading) * ray.direction)
                             by_diffuse = wp.cw_mul(part, ray.reflected)
                             by_glossy = ray.reflected - by_diffuse
@@ -379,9 +411,10 @@ def _made(
                 sky_sample = sky.sample(samplers.sky, scene, u_sky, at_first)
                 way = connect_direction(scene, s, wo, sky_sample.direction)
                 if way.arrives != 0:
-                    if has_panes(scene.panes):
-                        tint = glass_tint(scene, ray_origin(s), way.direction, float(wp.inf))
-                        way.scattered = wp.cw_mul(way.scattered, tint)
+                    if tints:
+                        if has_panes(scene.panes):
+                            tint = glass_tint(scene, ray_origin(s), way.direction, float(wp.inf))
+                            way.scattered = wp.cw_mul(way.scattered, tint)
                     source = sky.arrival(samplers.sky, scene, sky_sample, at_first)
                     if source.pdf > 0.0:
                         pdf = directions.pdf(samplers.directions, region, s, way.direction, way.bsdf_pdf)
@@ -409,9 +442,10 @@ def _made(
                         sample = connect_emitter(scene, s, wo, choice, u_point)
                         light = wp.vec3(0.0, 0.0, 0.0)
                         if sample.arrives > 0:
-                            if has_panes(scene.panes):
-                                tint = glass_tint(scene, ray_origin(s), sample.direction, sample.distance)
-                                sample.reflected = wp.cw_mul(sample.reflected, tint)
+                            if tints:
+                                if has_panes(scene.panes):
+                                    tint = glass_tint(scene, ray_origin(s), sample.direction, sample.distance)
+                                    sample.reflected = wp.cw_mul(sample.reflected, tint)
                             light = sample.reflected * (choice.weight / emitter_share)
                             choice.selected = 1.0
                             if sample.delta == 0:
@@ -439,11 +473,12 @@ def _made(
                 break
             carried = luminance(throughput)
             throughput = wp.cw_mul(throughput, sample_weight(s.bsdf, b.weight))
-            if has_panes(scene.panes):
-                t_hit = float(wp.inf)
-                if hit.face >= 0:
-                    t_hit = hit.t
-                throughput = wp.cw_mul(throughput, glass_tint(scene, ray_origin(s), wi, t_hit))
+            if tints:
+                if has_panes(scene.panes):
+                    t_hit = float(wp.inf)
+                    if hit.face >= 0:
+                        t_hit = hit.t
+                    throughput = wp.cw_mul(throughput, glass_tint(scene, ray_origin(s), wi, t_hit))
             reflected = wp.cw_mul(reflected, sample_weight(s.bsdf, b.reflected))
             if at_first:
                 first_reflected = wp.max(reflected)
@@ -516,7 +551,7 @@ def _made(
         return r
 
     # Thread: a pixel. Adds `sample_count` paths from its current camera sample.
-    @wp.kernel(module=wp.get_module(_module_name(lights, directions, sky, cache)), enable_backward=False)
+    @wp.kernel(module=wp.get_module(_module_name(lights, directions, sky, cache, tints)), enable_backward=False)
     def trace_paths(
         first: wp.int32,
         scene: SceneData,
@@ -536,13 +571,12 @@ def _made(
         count = wp.float32(settings.sample_count)
         if face < 0:
             background = sky.radiance(samplers.sky, scene, direction)
-            buffers.moment1[pixel] = buffers.moment1[pixel] + background * count
-            buffers.moment2[pixel] = buffers.moment2[pixel] + wp.cw_mul(background, background) * count
+            add_moments(buffers, pixel, of_layers(buffers, pixel, background), count)
             return
-        emission = surface_emission(scene, face, hits.u[pixel], hits.v[pixel], -direction)
+        drawn = surface_emission(scene, face, hits.u[pixel], hits.v[pixel], -direction)
+        emission = of_layers(buffers, pixel, drawn)
         if paths.terms == 0:
-            buffers.moment1[pixel] = buffers.moment1[pixel] + emission * count
-            buffers.moment2[pixel] = buffers.moment2[pixel] + wp.cw_mul(emission, emission) * count
+            add_moments(buffers, pixel, emission, count)
             return
         hit = BvhHit()
         hit.face = face
@@ -555,12 +589,12 @@ def _made(
         indirect = wp.vec3(0.0, 0.0, 0.0)
         moment1 = wp.vec3(0.0, 0.0, 0.0)
         moment2 = wp.vec3(0.0, 0.0, 0.0)
-        tint = tint_before(scene, s.position, direction, hits.t[pixel])
+        tint = first_tint(scene, s.position, direction, hits.t[pixel])
         first_index = pixel_sample_index(p[0], p[1], settings.first_sample, settings.sample_bits)
         for i in range(settings.sample_count):
             path = wp.int64(first + wp.tid()) * wp.int64(paths.spp) + wp.int64(settings.first_sample + i)
             r = trace_path(scene, samplers, hit, s, -direction, paths, first_index + wp.uint32(i), seed, path)
-            r = tinted(r, scene, tint)
+            r = with_tint(r, scene, tint)
             brightest = wp.max(r.indirect)
             if paths.clamp > 0.0 and brightest > paths.clamp:
                 r.indirect = r.indirect * (paths.clamp / brightest)

@@ -24,7 +24,7 @@ SIDE = wp.constant(2)  # places along a side of a texel, which smooths the edges
 MOST_PLACES = wp.constant(SIDE * SIDE)  # of a texel
 DARKER = wp.constant(wp.float32(0.1))  # share of the light of the brightest place, below which another may be behind
 
-TRACER = path_tracer(HIERARCHY_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY, SURFACE_CACHE)
+TRACER = path_tracer(HIERARCHY_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY, SURFACE_CACHE, tints=True)
 LightMapSamplers = TRACER.samplers
 trace_path = TRACER.trace_path
 

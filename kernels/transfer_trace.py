@@ -50,7 +50,7 @@ from warp_gi.kernels.types import SceneData
 
 wp.set_module_options({"enable_backward": False})
 
-TRACER = path_tracer(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY, TRANSFER_CACHE)
+TRACER = path_tracer(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY, TRANSFER_CACHE, tints=True)
 TransferSamplers = TRACER.samplers
 trace_path = TRACER.trace_path
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from warp_gi.kernels import bvh_build, checksum, compose, path_samplers
 from warp_gi.kernels.path_trace import path_tracer
+from warp_gi.scene.panes import has_colored_tint
 
 if TYPE_CHECKING:
     import warp as wp
@@ -47,4 +48,5 @@ def _tracer(pipeline: Pipeline, scene: Scene | BakedScene | None) -> list[wp.Ker
     regions = named.get(path_samplers.Regions) if uses_regions else None
     cache = next((one for one in caches if isinstance(one, path_samplers.PathCache)), path_samplers.NO_CACHE)
     sky = named.get(path_samplers.Sky, path_samplers.SCENE_SKY)
-    return [path_tracer(lights, directions, regions or path_samplers.NO_REGIONS, sky, cache).trace_paths]
+    tints = any(has_colored_tint(material) for material in getattr(scene, "materials", ()))
+    return [path_tracer(lights, directions, regions or path_samplers.NO_REGIONS, sky, cache, tints).trace_paths]

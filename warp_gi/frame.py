@@ -233,6 +233,15 @@ class Frame:
                 self._arrays[f"{name}_moment{order}"] = wp.zeros_like(self._arrays[name])
         return self._arrays[f"{name}_moment1"], self._arrays[f"{name}_moment2"]
 
+    def layer_emission(self) -> wp.array:
+        """Return the emission of the current camera sample as a mean over layers, which primaries write.
+
+        vec3 [height * width]; paths then take it for that of the surface drawn, in the moments of what they add up.
+        """
+        if "layer_emission" not in self._arrays:
+            self._arrays["layer_emission"] = wp.zeros_like(self._arrays["emission"])
+        return self._arrays["layer_emission"]
+
     def lobes(self) -> Lobes | None:
         """Return sums over samples that estimators may add to, as paths do, or None: then nobody reads them.
 
@@ -325,7 +334,7 @@ class Frame:
         settings.roulette_depth, settings.clamp = request.roulette_depth, request.clamp
         settings.sky_probability, settings.spp = self.sky_probability, self.settings.spp
         settings.cache_vertex, settings.lobes = request.cache_vertex, int(self.lobes() is not None)
-        tracer = path_trace.path_tracer(*request.samplers())
+        tracer = path_trace.path_tracer(*request.samplers(), tints=self.data.panes.count > 0)
         samplers = tracer.samplers()
         for name in tracer.samplers.vars:
             setattr(samplers, name, getattr(request, name).data)

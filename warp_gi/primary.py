@@ -44,5 +44,8 @@ class CameraRays(Primary):
         settings, cameras = frame.pass_settings, [frame.camera_data, frame.previous_camera_data]
         frame.launch_tiled(gbuffer.trace_primary, [frame.data, frame.camera_data, settings, frame.hits])
         buffers = frame.struct(gbuffer.SurfaceBuffers)
-        shade = layers.shade_layers if has_layers(frame.data) else gbuffer.shade_primary
-        frame.launch(shade, [frame.layer_data, *cameras, settings, frame.hits, buffers])
+        inputs = [frame.layer_data, *cameras, settings, frame.hits, buffers]
+        if has_layers(frame.data):
+            frame.launch(layers.shade_layers, [*inputs, frame.layer_emission()])
+        else:
+            frame.launch(gbuffer.shade_primary, inputs)

@@ -583,5 +583,6 @@ def test_paths_survive_by_what_they_met_after_the_first_vertex(albedo, roulette_
 
 def test_tracers_are_made_once_and_named_by_what_they_use():
     assert path_tracer(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY, NO_CACHE) is REFERENCE
-    names = [tracer.trace_paths.module.name.rpartition(".")[2] for tracer in (REFERENCE, RECORDER, CACHED)]
-    assert names == ["alias_bsdf", "alias_bsdf_sky_transfer", "alias_bsdf_cache_steady"]
+    tinted = path_tracer(ALIAS_LIGHTS, BSDF_DIRECTIONS, NO_REGIONS, tints=True)
+    names = [tracer.trace_paths.module.name.rpartition(".")[2] for tracer in (REFERENCE, RECORDER, CACHED, tinted)]
+    assert names == ["alias_bsdf", "alias_bsdf_sky_transfer", "alias_bsdf_cache_steady", "alias_bsdf_tints"]

@@ -119,7 +119,10 @@ def test_a_material_without_a_name(tmp_path):
 @pytest.mark.parametrize(("text", "file"), [("w #1.png", "w #1.png"), ("w.png # old", "w.png"), ('"w.png" #', "w.png")])
 def test_names_of_textures_may_hold_a_hash(text, file, tmp_path):
     (tmp_path / file).write_bytes(png(np.full((1, 1, 3), (9, 8, 7), np.uint8)))
-    found, told = material(tmp_path, f"Kd 1 1 1\nmap_Kd {text}\n")
+    scene, told = load(
+        tmp_path, f"mtllib a.mtl\n{SQUARE}vt 0 0\nusemtl m\nf 1/1 2/1 3/1\n", f"newmtl m\nKd 1 1 1\nmap_Kd {text}\n"
+    )
+    found = scene.materials[0]
     assert found.base_color_texture.pixels[0, 0].tolist() == [9, 8, 7, 255] and not told
 
 

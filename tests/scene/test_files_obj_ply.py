@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import struct
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -195,6 +196,9 @@ def test_maps_of_holes_alone_are_cut_and_others_blended(middle, factor, blends, 
         ("Kd 0.588 0.588 0.588\nKs 0.9 0.9 0.9\n", 0.0, (0.588, 0.588, 0.588)),
         ("Kd 0.1 0.1 0.1\nKs 0.9 0.8 0.7\n", 1.0, (0.9, 0.8, 0.7)),
         ("Kd 0 0 0\nKs 0.6 0.6 0.6\n", 1.0, (0.6, 0.6, 0.6)),
+        ("Kd 0 0 0\nKs 0.9 0.6 0.2\n", 1.0, (0.9, 0.6, 0.2)),  # gold: its blue is dark
+        ("Kd 0 0 0\nKs 0.9 0 0\n", 1.0, (0.9, 0.0, 0.0)),
+        ("Kd 0 0 0\nKs 0.2 0.1 0.1\n", 0.0, (0.0, 0.0, 0.0)),
         ("Kd 0.4 0.3 0.2\nKs 0.9 0.9 0.9\nPm 0.5\nPr 0.25\n", 0.5, (0.4, 0.3, 0.2)),
     ],
 )
@@ -233,7 +237,7 @@ def test_textures_of_another_machine_lie_beside_the_library(name, tmp_path):
     (tmp_path / "lib").mkdir()
     (tmp_path / "lib" / "wood.png").write_bytes(png(np.full((1, 1, 3), (9, 8, 7), np.uint8)))
     (tmp_path / "lib" / "a.mtl").write_text(f"newmtl m\nKd 1 1 1\nmap_Kd {name}\n")
-    (tmp_path / "a.obj").write_text(f"mtllib lib/a.mtl\n{SQUARE}usemtl m\nf 1 2 3 4\n")
+    (tmp_path / "a.obj").write_text(f"mtllib lib/a.mtl\n{SQUARE}vt 0 0\nusemtl m\nf 1/1 2/1 3/1 4/1\n")
     np.testing.assert_array_equal(
         gi.load_scene(tmp_path / "a.obj").materials[0].base_color_texture.pixels[0, 0], [9, 8, 7, 255]
     )
@@ -257,7 +261,84 @@ def test_what_mtl_holds_beside_is_named(tmp_path):
         assert f"uses {what}" in told and "(material 'm')" in told
 
 
+@pytest.mark.parametrize("illum", [4, 6, 7, 9])
+def test_coverage_without_a_tint_is_no_pane(illum, tmp_path):
+    """Exporters write such values for all that is not opaque."""
+    with pytest.warns(gi.UnsupportedWarning, match="with Tf, a pane .* else d is coverage"):
+        found = material(tmp_path, f"Kd 1 0 0\nd 0.25\nillum {illum}\n")
+    assert (found.alpha, found.alpha_blend, found.transmission) == (0.25, True, 0.0)
+
+
+@pytest.mark.parametrize("option", ["-mm 0.2 0.5", "-t 1 1 0", "-cc on", "-imfchan l"])
+def test_options_of_maps_that_change_their_values_are_named(option, tmp_path):
+    with pytest.warns(gi.UnsupportedWarning, match=f"other options of maps .*{option} of map_kd of material 'm'"):
+        found = material(tmp_path, f"Kd 1 1 1\nmap_Kd {option} c.png\n", c=(255, 0, 0))
+    assert found.base_color_texture.name == "c.png"
+
+
+@pytest.mark.parametrize("option", ["-mm 0 1", "-mm 0", "-t 0 0 0", "-cc off", "-boost 2", "-texres 64", "-blendv off"])
+def test_options_of_maps_that_change_nothing_are_not(option, tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        material(tmp_path, f"Kd 1 1 1\nmap_Kd {option} c.png\n", c=(255, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("obj", "told"),
+    [
+        (f"{SQUARE}usemtl a\nf 1 2 3\nusemtl b\nf 1 3 4\n", r"names materials 'a', 'b' and no library \(mtllib\)"),
+        (f"mtllib a.mtl\n{SQUARE}usemtl b\nf 1 2 3\n", "material 'b' is not in its library; plain grey"),
+        (
+            f"mtllib a.mtl\n{SQUARE}usemtl b\nf 1 2 3\n" + "".join(f"usemtl {k}\nf 1 3 4\n" for k in range(4)),
+            "materials 'b', '0', '1' and 2 more are not in its library",
+        ),
+        (
+            f"{SQUARE}f 1 2 3\ncall more.obj\nusemap wood\n",
+            r"other statements of OBJ.*\('call', line 6, 'usemap', line 7\)",
+        ),
+    ],
+)
+def test_what_obj_names_and_does_not_hold_is_told(obj, told, tmp_path):
+    with pytest.warns(UserWarning, match=told):
+        gi.load_scene(written(tmp_path, obj, "# nothing\n"))
+
+
+def test_textures_of_faces_without_coordinates_are_named(tmp_path):
+    mtl = "newmtl m\nKd 1 1 1\nmap_Kd c.png\nnewmtl plain\nKd 1 0 0\n"
+    text = f"mtllib a.mtl\n{SQUARE}vt 0 0\nusemtl m\nf 1/1 2/1 3/1\n"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        gi.load_scene(written(tmp_path, f"{text}usemtl plain\nf 1 3 4\n", mtl, c=(255, 0, 0)))
+    with pytest.warns(gi.UnsupportedWarning, match="textures without their coordinates \\(material 'm'\\)"):
+        gi.load_scene(written(tmp_path, f"{text}f 1 3 4\n", mtl, c=(255, 0, 0)))
+
+
 # ---- PLY ----
+
+
+@pytest.mark.parametrize("order", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("faces", [False, True])
+def test_strips_are_triangles(order, faces, tmp_path):
+    """A strip of three, one of two of which one names a vertex twice, one of two corners; and a face, or none."""
+    strips = [[0, 1, 2, 3, 4, -1, 5, 6, 7, 7, -1, 0, 1], [8, 7, 6]]
+    expected = [[0, 1, 2], [2, 1, 3], [2, 3, 4], [5, 6, 7], [8, 7, 6]]
+    points = np.array([[k // 2, k % 2, 0.1 * k] for k in range(9)], np.float32)
+    header = f"ply\nformat {order} 1.0\nelement vertex 9\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    header += "element face 1\nproperty list uchar int vertex_indices\n" if faces else ""
+    header += "element tristrips 2\nproperty list int int vertex_indices\nend_header\n"
+    if order == "ascii":
+        lines = [" ".join(map(str, row)) for row in [*points.tolist(), *([[3, 4, 5, 8]] if faces else [])]]
+        body = "\n".join([*lines, *(f"{len(one)} {' '.join(map(str, one))}" for one in strips)]).encode()
+    else:
+        end = "<" if "little" in order else ">"
+        body = points.astype(end + "f4").tobytes()
+        body += np.uint8([3]).tobytes() + np.array([4, 5, 8], end + "i4").tobytes() if faces else b""
+        body += b"".join(np.array([len(one), *one], end + "i4").tobytes() for one in strips)
+    (tmp_path / "a.ply").write_bytes(header.encode() + body)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = gi.load_scene(tmp_path / "a.ply")
+    np.testing.assert_array_equal(scene._flat.indices, [[4, 5, 8], *expected] if faces else expected)
 
 
 @pytest.mark.parametrize("name", ["ascii", "little", "big"])

@@ -185,10 +185,10 @@ def veiled_room():
     )
 
 
-def glazed_room():
-    """A room lit by the sky through a window of grey glass, with a pane before its red wall."""
+def glazed_room(color=(0.9, 0.9, 0.9), through=0.9):
+    """A room lit by the sky through a window of glass, grey or coloured, with a pane before its red wall."""
     red = gi.Material("red", (0.8, 0.1, 0.1), specular=0.0)
-    clear = gi.Material("clear", (0.9, 0.9, 0.9), roughness=0.2, transmission=0.9)
+    clear = gi.Material("clear", color, roughness=0.2, transmission=through)
     floor = gi.Material("floor", (0.7, 0.7, 0.7), specular=0.0)
     return scene_of(
         quad((-4, 0, 4), (8, 0, 0), (0, 0, -8), floor, "floor"),
@@ -246,3 +246,15 @@ def test_a_lamp_behind_a_decal_shines_through_it():
     camera = gi.Camera.look_at((0, 0.01, 3), (0, 0.01, 0), hfov=30, resolution=(16, 12))
     frame = next(gi.render(scene_of(pane(0.0, black), pane(0.0, lamp)), camera, gi.Pipeline(spp=4)))
     np.testing.assert_allclose(frame.numpy("emission"), 1.0, rtol=1e-3)
+
+
+def test_emission_of_layers_adds_nothing_to_the_variance():
+    """It is their mean, whichever the rays drew; a lamp behind a veil has no noise, and the variance says so."""
+    lamp = gi.Material("lamp", (0.0, 0.0, 0.0), specular=0.0, emission=(5.0, 2.0, 1.0))
+    scene = scene_of(pane(0.0, veil(0.5, emission=(0.0, 1.0, 3.0))), pane(-1.0, lamp))
+    frame = next(gi.render(scene, WALL, gi.Pipeline(spp=16, camera_samples=16), device=str(st.device())))
+    np.testing.assert_allclose(frame.numpy("beauty"), np.broadcast_to([2.5, 1.5, 2.0], (24, 32, 3)), rtol=1e-5)
+    assert frame.numpy("variance").max() < 1e-9
+    sky = scene_of(pane(0.0, veil(0.5)), environment=tuple(SKY))
+    frame = next(gi.render(sky, WALL, gi.Pipeline(spp=16, camera_samples=16), device=str(st.device())))
+    assert frame.numpy("variance").max() < 1e-9

@@ -4,9 +4,10 @@ How MTL becomes glTF's metallic-roughness: ``Kd`` (times ``map_Kd``) is the base
 ``map_Kd`` counts as white, as its exporters meant it. ``Pr`` and ``Pm`` are roughness and metallic factor. Without them
 ``Ns`` is a Blinn-Phong exponent: the roughness is (2 / (Ns + 2))^(1/4), and its GGX alpha the square of that. ``Ks`` is
 the reflectance at normal incidence, so the specular factor is max(Ks) / 0.04, at most 1, and Ks 0 is pure Lambert. It
-is the colour of a metal where a metal can be: there is no ``map_Kd``, every channel of Ks is above 0.25 and above Kd,
-Kd and Ks add up to 1 or less, and Kd is not coloured beside a grey Ks. ``Ke`` (times ``map_Ke``) is emitted radiance.
-``map_d``, or ``d``, or 1 - ``Tr``, is coverage; ``Tr 1`` without ``d`` is opaque, as its writers mean it.
+is the colour of a metal where a metal can be: there is no ``map_Kd``, every channel of Ks is above 0.25 (one of them,
+where Kd is black) and above Kd, Kd and Ks add up to 1 or less, and Kd is not coloured beside a grey Ks. ``Ke`` (times
+``map_Ke``) is emitted radiance. ``map_d``, or ``d``, or 1 - ``Tr``, is coverage; ``Tr 1`` without ``d`` is opaque, as
+its writers mean it.
 ``norm`` is a normal map. Both sides emit. A colour of one number is grey.
 """
 
@@ -27,6 +28,7 @@ from warp_gi.scene.model import Material, Texture
 
 GREY_STEP = 0.02  # difference between channels below which a colour is grey
 METAL_SPECULAR = 0.25
+BLACK = 1e-3  # largest channel of a colour that counts as none
 OPTION_ARGUMENTS = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}
 """Number of arguments of MTL map options that take more or fewer than one."""
 MAP_FEATURES = {
@@ -195,6 +197,8 @@ class MtlReader:
         for key in source.maps:
             if key in MAP_FEATURES:
                 self.findings.add(MAP_FEATURES[key], what)
+            for option in _further_options(source.maps[key]) if key in MAPS else ():
+                self.findings.add("other options of maps (-mm, -t, -cc, -imfchan)", f"{option} of {key} of {what}")
         for key, feature in NUMBER_FEATURES.items():
             if _first(source.numbers, key, 0.0) > 0.0:
                 self.findings.add(feature, what)
@@ -285,7 +289,8 @@ class MtlReader:
 def _is_metal(diffuse: np.ndarray, specular: np.ndarray) -> bool:
     """Return whether a material of these colours can only be meant as a metal."""
     is_colored = np.ptp(diffuse) > GREY_STEP and np.ptp(specular) <= GREY_STEP
-    is_bright = specular.min() > METAL_SPECULAR and np.all(specular > diffuse)
+    darkest = specular.max() if diffuse.max() <= BLACK else specular.min()
+    is_bright = darkest > METAL_SPECULAR and np.all(specular >= diffuse)
     return bool(is_bright and not is_colored and np.all(specular + diffuse <= 1.0 + 1e-6))
 
 
@@ -311,25 +316,48 @@ def _color(numbers: dict[str, list[float]], key: str, default: float, highest: f
     return np.clip(np.array(values[:3] if len(values) >= 3 else values[:1] * 3), 0.0, highest)
 
 
-def _map_options(words: list[str]) -> tuple[str, str, np.ndarray]:
-    """Return the file name as it stands, the wrap mode, and scale and offset [2, 3] of a map statement.
-
-    Its options come first.
-    """
-    wrap, at, transform = "repeat", 0, np.eye(2, 3)
+def _options(words: list[str]) -> tuple[list[tuple[str, list[str]]], int]:
+    """Return the options of a map statement, which come first, with their arguments; and where its file name begins."""
+    found: list[tuple[str, list[str]]] = []
+    at = 0
     while at < len(words) - 1 and words[at].startswith("-"):
         option, at = words[at].lower(), at + 1
-        if option == "-clamp" and words[at].lower() == "on":
-            wrap = "clamp"
-        values = []
+        values: list[str] = []
         for count in range(OPTION_ARGUMENTS.get(option, 1)):
             if at < len(words) - 1 and (count == 0 or _is_number(words[at])):
                 values.append(words[at])
                 at += 1
+        found.append((option, values))
+    return found, at
+
+
+def _map_options(words: list[str]) -> tuple[str, str, np.ndarray]:
+    """Return the file name as it stands, the wrap mode, and scale and offset [2, 3] of a map statement."""
+    wrap, transform = "repeat", np.eye(2, 3)
+    options, at = _options(words)
+    for option, values in options:
+        if option == "-clamp" and values and values[0].lower() == "on":
+            wrap = "clamp"
         if option in ("-s", "-o") and all(_is_number(value) for value in values):
             for axis, value in enumerate(values[:2]):
                 transform[axis, axis if option == "-s" else 2] = float(value)
     return " ".join(words[at:]), wrap, transform
+
+
+def _further_options(words: list[str]) -> list[str]:
+    """Return the options of a map that change what it shows and are not read, such as "-mm 0.2 0.5"."""
+    found = []
+    for option, values in _options(words)[0]:
+        numbers = [float(value) for value in values if _is_number(value)]
+        changes = {
+            "-mm": numbers not in ([0.0, 1.0], [0.0]),
+            "-t": any(numbers),
+            "-cc": values[:1] == ["on"],
+            "-imfchan": True,
+        }
+        if changes.get(option, False):
+            found.append(" ".join([option, *values]))
+    return found
 
 
 def unquoted(name: str) -> str:

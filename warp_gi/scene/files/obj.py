@@ -15,9 +15,10 @@ from warp_gi.scene.files.mtl import ELSEWHERE, MtlMaterial, MtlReader, read_mtl,
 from warp_gi.scene.files.obj_text import ObjStatements, parse
 from warp_gi.scene.files.parts import SceneParts
 from warp_gi.scene.files.polygons import triangulate
-from warp_gi.scene.files.support import Findings
+from warp_gi.scene.files.support import MOST_PLACES, Findings
 from warp_gi.scene.files.text import read_bytes, without_comment
 from warp_gi.scene.model import Mesh, Node
+from warp_gi.scene.textures import TEXTURE_SLOTS
 
 
 def read_obj(path: Path) -> SceneParts:
@@ -30,8 +31,12 @@ def read_obj(path: Path) -> SceneParts:
             statements = {**read_mtl(file), **statements}
     _name_materials(obj, statements)
     unknown = [name for name in obj.materials if name not in statements]
-    if unknown and statements:
-        findings.lost.append(f"{str(path)!r}: material {unknown[0]!r} is not in its library; plain grey")
+    if unknown and not obj.libraries:
+        findings.lost.append(f"{str(path)!r} names {_list(unknown)} and no library (mtllib); plain grey")
+    elif unknown and not any("is missing" in line for line in findings.lost):
+        findings.lost.append(
+            f"{str(path)!r}: {_list(unknown)} {'is' if len(unknown) == 1 else 'are'} not in its library; plain grey"
+        )
     if (obj.face_smooth & (obj.corners[np.cumsum(obj.sizes) - obj.sizes, 2] < 0)).any():
         findings.add("smoothing groups")
     reader = MtlReader(path, statements, findings)
@@ -41,8 +46,20 @@ def read_obj(path: Path) -> SceneParts:
     for index in dict.fromkeys(obj.face_materials.tolist()):
         name = obj.materials[index] if index >= 0 else None
         mesh = _mesh(obj, triangles[materials == index], reader, name, path.stem)
+        if (
+            any(getattr(mesh.material, slot) is not None for slot in TEXTURE_SLOTS)
+            and (obj.corners[triangles[materials == index].reshape(-1), 1] < 0).any()
+        ):
+            findings.add("textures without their coordinates", f"material {mesh.material.name!r}")
         nodes.append(Node(mesh.name, [mesh]))
     return SceneParts(nodes, findings=findings)
+
+
+def _list(names: list[str]) -> str:
+    """Return the first names of materials, and how many there are more."""
+    few = ", ".join(map(repr, names[:MOST_PLACES]))
+    more = f" and {len(names) - MOST_PLACES:,} more" if len(names) > MOST_PLACES else ""
+    return f"{'material' if len(names) == 1 else 'materials'} {few}{more}"
 
 
 def _name_materials(obj: ObjStatements, statements: dict[str, MtlMaterial]) -> None:

@@ -21,6 +21,8 @@ VERTEX, COORDINATE, NORMAL, FACE = range(4)
 KEYWORDS = {b"v": VERTEX, b"vt": COORDINATE, b"vn": NORMAL, b"f": FACE, b"fo": FACE}
 CORNER = re.compile(r"[-+]?\d+(/([-+]?\d+)?){0,2}")
 NOT_ROUNDING = 1.001  # colours above this are no rounded ones
+UNSEEN = {"o", "g", "mg", "lod", "bevel", "c_interp", "d_interp", "shadow_obj", "trace_obj", "ctech", "stech", "s"}
+"""Statements without a warning: names, and what changes no polygon."""
 CURVES = {"vp", "cstype", "deg", "bmat", "step", "curv", "curv2", "surf", "parm", "trim", "hole", "scrv", "sp", "end"}
 
 
@@ -145,6 +147,8 @@ def _others(lines: _Lines, result: ObjStatements, face_lines: np.ndarray, findin
             findings.add("points and lines", where)
         elif keyword in CURVES:
             findings.add("free-form curves and surfaces", where)
+        elif keyword not in UNSEEN:
+            findings.add("other statements of OBJ, such as call and usemap", f"{words[0][:20]!r}, {where}")
     result.materials = list(index_of)
     for target, rows in ((result.face_materials, used), (result.face_smooth, smooth)):
         at, values = np.array(rows, np.int64).T

@@ -83,12 +83,42 @@ def read_ply(path: Path) -> SceneParts:
     if vertices is None or points is None:
         raise SceneError(f"{str(path)!r} has no vertices with x, y and z; export it again")
     _note(elements, data[:body], findings)
-    index_name = next((name for name in INDEX_NAMES if faces is not None and name in faces.sizes), None)
-    if faces is None or index_name is None or not len(faces.sizes[index_name]):
+    corners, sizes = _lists(faces)
+    strips = _strip_triangles(*_lists(by_name.get("tristrips")))
+    corners, sizes = np.concatenate([corners, strips]), np.concatenate([sizes, np.full(len(strips) // 3, 3)])
+    if not len(sizes):
         findings.warn(path, stacklevel=4)
         raise SceneError(f"{str(path)!r} holds no triangles; export it with faces")
-    mesh = _mesh(vertices, points, faces.values[index_name], faces.sizes[index_name], path, findings)
+    mesh = _mesh(vertices, points, corners, sizes, path, findings)
     return SceneParts([Node(path.stem, [mesh])], findings=findings)
+
+
+def _lists(element: Element | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lists of vertices of an element, one after the other, and the length of each."""
+    name = next((one for one in INDEX_NAMES if element is not None and one in element.sizes), None)
+    if element is None or name is None:
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    return element.values[name], element.sizes[name]
+
+
+def _strip_triangles(strips: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Return the corners of all triangles of strips, three for each; every second one is turned around.
+
+    A negative index ends a strip, as the end of its list does. Triangles that name a vertex twice are left out.
+    """
+    ends = np.cumsum(sizes)
+    at = np.arange(len(strips))
+    breaks = np.zeros(len(strips) + 1, bool)  # whether a strip begins here
+    breaks[ends - sizes] = True
+    breaks[1:] |= strips < 0
+    begin = np.maximum.accumulate(np.where(breaks[:-1], at, 0))
+    last = at - begin >= 2
+    last[2:] &= (strips[2:] >= 0) & (strips[1:-1] >= 0) & (strips[:-2] >= 0)
+    third = np.flatnonzero(last)
+    is_odd = (third - begin[third]) % 2 == 1
+    corners = np.stack([strips[third - 2 + is_odd], strips[third - 1 - is_odd], strips[third]], axis=1)
+    distinct = (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2]) & (corners[:, 0] != corners[:, 2])
+    return corners[distinct].reshape(-1)
 
 
 def _header(data: bytes, path: Path) -> tuple[list[Element], str, int]:
@@ -343,8 +373,6 @@ def _note(elements: list[Element], header: bytes, findings: Findings) -> None:
     for element in elements:
         if element.name == "edge" and element.count:
             findings.add("points and lines", "element 'edge'")
-        elif element.name == "tristrips" and element.count:
-            findings.add("triangle strips of PLY")
         elif element.name == "face" and any(set(names) <= element.values.keys() for names in COLOR_NAMES):
             findings.add("colours of faces")
     if b"TextureFile" in header or any("texcoord" in element.sizes for element in elements):
