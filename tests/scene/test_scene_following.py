@@ -98,6 +98,26 @@ def test_a_lamp_goes_out_and_another_material_begins_to_shine():
     assert scene.emitter_count == 1
 
 
+def test_lamps_follow_the_size_of_things():
+    """One without an area shines no more, and light from afar has a power by the size of the scene."""
+    scene = robot()
+    scene.lights.append(PunctualLight("directional", (0.3, 0.3, 0.3), direction=(0.0, -1.0, -0.2)))
+    pipeline = replace(PATH, emitters=gi.PowerLights())
+    scheduler = gi.FrameScheduler(scene, CAMERA, pipeline)
+    scheduler.frame(0)
+    powers = scene.emitter_powers()
+    scene.nodes[0].parent_from_node = np.diag((9.0, 1.0, 9.0, 1.0))
+    assert_same_picture(scheduler.frame(0), scene, pipeline)
+    assert scene.emitter_powers()[-1] > 9 * powers[-1]
+    shown = scene.nodes[3].parent_from_node
+    scene.nodes[3].parent_from_node = shown @ np.diag((1e-12, 1e-12, 1e-12, 1.0))
+    assert_same_picture(scheduler.frame(0), scene, pipeline)
+    assert scene.emitter_count == 2
+    scene.nodes[3].parent_from_node = shown
+    assert_same_picture(scheduler.frame(0), scene, pipeline)
+    assert scene.emitter_count == 3
+
+
 def test_points_are_set_by_a_call():
     scene = robot()
     floor = scene.nodes[0].meshes[0]

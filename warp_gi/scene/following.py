@@ -95,9 +95,9 @@ def reshape(scene: SceneContents, edited: Iterable[int]) -> None:
         set_areas(scene)
         scene._emissive, scene._light_grids = lights_of(scene)
     for device, trail in zip(devices, before, strict=True):
-        device.settle(trail)
         if is_lit:
             device.relight()
+        device.settle(trail)
     scene.version += 1
 
 
