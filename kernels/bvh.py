@@ -8,7 +8,7 @@ direction's length, and pass through triangles where alpha lets them; only CUDA'
 import warp as wp
 
 from warp_gi.kernels.bvh_native import ALPHA, BLOCK_STEPS, THROUGH, TRANSPARENT, cpu_only
-from warp_gi.kernels.bvh_traversal_native import INTERSECT, OCCLUDED
+from warp_gi.kernels.bvh_queries_native import INTERSECT, OCCLUDED
 from warp_gi.kernels.types import Bvh
 
 wp.set_module_options({"enable_backward": False})

@@ -1,4 +1,4 @@
-"""Native code of the CPU's ray queries (bvh.py): the alpha test, the traversals of the eight-wide tree.
+"""Native code of the CPU's ray queries (bvh.py): the layout of the eight-wide tree, and the alpha test.
 
 Node, 56 words: six rows of eight floats, the low x, y, z and high x, y, z of its children's boxes; eight children.
 Block, 80 words: nine rows of eight floats, the x, y, z of vertices 0, 1, 2 of its triangles; eight face words. A child

@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_gi.kernels.bvh import mesh_intersect, mesh_occluded, runs_on_cuda
 from warp_gi.kernels.bvh_native import cpu_only
-from warp_gi.kernels.bvh_traversal_native import INTERSECT_RAYS, OCCLUDED_RAYS
+from warp_gi.kernels.bvh_queries_native import INTERSECT_RAYS, OCCLUDED_RAYS
 from warp_gi.kernels.types import Bvh
 
 wp.set_module_options({"enable_backward": False})
