@@ -78,8 +78,10 @@ def replacing(path: str | Path, own_folder: bool = False) -> Iterator[Path]:
         with open(file, "rb+") as written:
             os.fsync(written.fileno())
         os.replace(file, path)
-    except BaseException:
+    except BaseException as error:
         _remove(part)
+        if isinstance(error, OSError) and error.errno and error.filename in (None, str(part), str(file)):
+            raise OSError(error.errno, error.strerror, str(path)) from error  # a full disk: where, and not of what name
         raise
     else:
         if own_folder:

@@ -7,6 +7,7 @@ it however the process ends, in a container too. What nobody holds is removed by
 from __future__ import annotations
 
 import contextlib
+import errno
 import glob
 import json
 import os
@@ -74,8 +75,15 @@ class Claim:
             os.close(file)
             part.unlink(missing_ok=True)
             return
-        os.write(file, json.dumps(self._about).encode())
-        os.replace(part, self.path)  # nobody sees it before it is locked
+        about = json.dumps(self._about).encode()
+        try:
+            if os.write(file, about) != len(about):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            os.replace(part, self.path)  # nobody sees it before it is locked
+        except OSError as error:
+            os.close(file)
+            part.unlink(missing_ok=True)
+            raise OSError(error.errno, f"nothing can be written here ({error.strerror})", str(part.parent)) from error
         self._file = file
         for other in self._others():
             if self._is_against(other):
