@@ -16,6 +16,7 @@ from warp_gi.cli.inputs import (
     BAKE_SUFFIX,
     DEFAULT_SCENE,
     SceneOptions,
+    check_camera_options,
     find_camera,
     find_scene,
     move_sky,
@@ -37,7 +38,7 @@ from warp_gi.scene.scene import Scene
 from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence.frame_time import parse_seconds, take_time
 from warp_gi.sequence.frames import parse_frames
-from warp_gi.sequence.resume import Output, Plan, SequenceRun, Shot, shots_of
+from warp_gi.sequence.resume import Output, Plan, SequenceRun, Shot, check_frames, shots_of
 
 DESCRIPTION = """Render a sequence of frames to EXR files with named layers, and PNG previews.
 
@@ -139,6 +140,7 @@ def run(options: Render, report: Reporter) -> None:
     frame_time = parse_seconds(options.frame_time) if options.frame_time else None
     output = find_output(options)
     check_targets(options)
+    check_camera_options(options)
     bakes = [load_bake(path) for path in options.bake]
     device = launch.get_device(options.device)
     launch.load_ahead(kernels_of(options.settings), device)
@@ -215,7 +217,9 @@ def find_shots(options: Render, camera: Camera | CameraPath) -> list[Shot]:
 
 def check_targets(options: Render) -> None:
     """Raise before the scene is loaded, for frames that are none and for files that cannot be written."""
-    for index in parse_frames(options.frames) if options.frames else [0]:
+    frames = parse_frames(options.frames) if options.frames else [0]
+    check_frames(frames, options.output)
+    for index in frames:
         path = frame_path(options.output, index)
         if not options.resume or not path.is_file():  # a whole one is kept
             check_target(path)
