@@ -337,3 +337,15 @@ def test_one_field_of_view_is_given():
     with pytest.raises(gi.OptionError, match="both hfov and vfov"):
         gi.Camera.look_at((0, 0, 3), (0, 0, 0), hfov=40, vfov=30)
     assert gi.Camera.look_at((0, 0, 3), (0, 0, 0)).hfov == 65.0
+
+
+def test_fields_of_keyframes_that_nothing_reads_are_named(tmp_path):
+    key = {"time": 0, "eye": [0, 0, 3], "target": [0, 0, 0]}
+    document = {"resolution": [640, 480], "keyframes": [key | {"fov": 30}]}
+    with pytest.warns(
+        UserWarning, match="keyframe 0 of a camera path has 'fov', which nothing reads; known are .*hfov"
+    ):
+        assert CameraPath.load(write(tmp_path / "a.json", document)).camera(0).hfov == 65.0
+    document["keyframes"] = [key | {"K": [[500, 0, 320], [0, 500, 240], [0, 0, 1]], "hfov": 20}]
+    with pytest.raises(SceneError, match="keyframe 0 has K and hfov, which follows from it; leave one out"):
+        CameraPath.load(write(tmp_path / "a.json", document))
