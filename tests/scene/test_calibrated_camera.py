@@ -308,3 +308,44 @@ def test_settings_of_a_camera_have_to_be_numbers(change):
         gi.Camera(np.eye(4), **change)
     with pytest.raises(OptionError, match="must be a 4x4 matrix of numbers"):
         gi.Camera([["a"]])
+
+
+def test_matrices_and_focal_lengths_that_cannot_be_meant_are_refused():
+    """A transposed placement would lose its position, a sheared one turn, and a K of pictures see half a sphere."""
+    K, size = [[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], (640, 480)
+    placed = np.eye(4)
+    placed[:3, 3] = 1, 2, 3
+    with pytest.raises(gi.OptionError, match=r"last row .* 0 0 0 1, got \[1.0, 2.0, 3.0, 1.0\]; transpose"):
+        gi.Camera.from_intrinsics(K, placed.T, size)
+    with pytest.raises(gi.OptionError, match="last row"):
+        gi.Camera(placed.T, 60.0, size)
+    sheared = placed.copy()
+    sheared[0, 1] = 0.5
+    with pytest.raises(gi.OptionError, match="sheared: its axes must be perpendicular"):
+        gi.Camera.from_intrinsics(K, sheared, size)
+    rounded = placed.copy()
+    rounded[:3, :3] = np.round(np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]) * 2.0 + 1e-4, 3)
+    assert gi.Camera.from_intrinsics(K, rounded, size).position.tolist() == [1, 2, 3]
+    with pytest.raises(gi.OptionError, match="K must be in pixels of 640x480"):
+        gi.Camera.from_intrinsics([[0.8, 0, 0.5], [0, 1.1, 0.5], [0, 0, 1]], placed, size)
+    with pytest.raises(gi.OptionError) as told:
+        gi.Camera.from_intrinsics(K, placed * np.nan, size)
+    assert "\n" not in str(told.value)
+
+
+def test_one_field_of_view_is_given():
+    with pytest.raises(gi.OptionError, match="both hfov and vfov"):
+        gi.Camera.look_at((0, 0, 3), (0, 0, 0), hfov=40, vfov=30)
+    assert gi.Camera.look_at((0, 0, 3), (0, 0, 0)).hfov == 65.0
+
+
+def test_fields_of_keyframes_that_nothing_reads_are_named(tmp_path):
+    key = {"time": 0, "eye": [0, 0, 3], "target": [0, 0, 0]}
+    document = {"resolution": [640, 480], "keyframes": [key | {"fov": 30}]}
+    with pytest.warns(
+        UserWarning, match="keyframe 0 of a camera path has 'fov', which nothing reads; known are .*hfov"
+    ):
+        assert CameraPath.load(write(tmp_path / "a.json", document)).camera(0).hfov == 65.0
+    document["keyframes"] = [key | {"K": [[500, 0, 320], [0, 500, 240], [0, 0, 1]], "hfov": 20}]
+    with pytest.raises(SceneError, match="keyframe 0 has K and hfov, which follows from it; leave one out"):
+        CameraPath.load(write(tmp_path / "a.json", document))

@@ -166,3 +166,19 @@ def test_a_camera_without_a_lens_is_left_out_with_a_line(tmp_path):
     with pytest.warns(UserWarning, match="camera 0 has neither .* orthographic lens; it is left out") as caught:
         assert not loaded(glb, tmp_path).cameras
     assert len(caught) == 1
+
+
+def test_values_that_overlap_are_a_fault(tmp_path):
+    glb = one_triangle()
+    view = glb.json["accessors"][primitive(glb)["attributes"]["POSITION"]]["bufferView"]
+    glb.json["bufferViews"][view]["byteStride"] = 4
+    with pytest.raises(gi.SceneError, match="values of 12 bytes overlap: byteStride of its buffer view is 4"):
+        loaded(glb, tmp_path)
+
+
+def test_a_node_with_a_matrix_and_more_is_named(tmp_path):
+    glb = one_triangle()
+    glb.json["nodes"][0] |= {"matrix": np.diag([2.0, 2, 2, 1]).ravel().tolist(), "translation": [5, 0, 0]}
+    with pytest.warns(UserWarning, match="node 'n' has a matrix, and translation, .* the matrix counts"):
+        scene = loaded(glb, tmp_path)
+    np.testing.assert_array_equal(scene.world_from_node(0, 0.0), np.diag([2.0, 2, 2, 1]))

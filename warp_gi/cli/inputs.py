@@ -142,20 +142,32 @@ def move_sky(scene: Scene, turn: float, camera: Camera | CameraPath, frames: Ite
         scene.environment = TurningSky(sky, turn, fps) if turn else sky
 
 
+def check_camera_options(options: SceneOptions) -> None:
+    """Raise OptionError for options of a camera that do not go together, before a scene is loaded."""
+    for name, angle in (("--hfov", options.hfov), ("--vfov", options.vfov)):
+        if angle is not None and not 0.0 < angle < 180.0:
+            raise OptionError(f"{name} must be between 0 and 180 degrees, got {angle:g}")
+    if options.hfov is not None and options.vfov is not None:
+        raise OptionError("--hfov and --vfov exclude each other; give one")
+    if (options.eye is None) != (options.target is None):
+        raise OptionError("--eye and --target go together; give both")
+    if options.eye is not None and options.camera:
+        raise OptionError("--camera and --eye exclude each other; give one")
+    if options.ortho is not None and (options.hfov is not None or options.vfov is not None):
+        raise OptionError("--ortho goes without --hfov and --vfov: parallel rays have no field of view")
+    if options.ortho is not None and not (options.ortho > 0 and math.isfinite(options.ortho)):
+        raise OptionError(f"--ortho must be a width above 0 m, got {options.ortho:g}")
+
+
 def find_camera(options: SceneOptions, scene: Scene | BakedScene, report: Reporter) -> Camera | CameraPath:
     """Return the camera or path that was asked for, counted from where the scene's positions are."""
+    check_camera_options(options)
     camera = _find_camera(options, scene, report)
     if options.vfov is not None:
-        if options.hfov is not None:
-            raise OptionError("--hfov and --vfov exclude each other; give one")
         if isinstance(camera, CameraPath):
             raise OptionError("--vfov goes with a still camera; a camera path has its own field of view")
         camera = camera.with_vfov(options.vfov)
     if options.ortho is not None:
-        if options.hfov is not None or options.vfov is not None:
-            raise OptionError("--ortho goes without --hfov and --vfov: parallel rays have no field of view")
-        if not (options.ortho > 0 and math.isfinite(options.ortho)):
-            raise OptionError(f"--ortho must be a width above 0 m, got {options.ortho:g}")
         if isinstance(camera, CameraPath):
             raise OptionError("--ortho goes with a still camera; keyframes of a camera path have ortho_width")
         camera = replace(camera, ortho_width=options.ortho, keeps_vertical=False)
@@ -163,13 +175,7 @@ def find_camera(options: SceneOptions, scene: Scene | BakedScene, report: Report
 
 
 def _find_camera(options: SceneOptions, scene: Scene | BakedScene, report: Reporter) -> Camera | CameraPath:
-    if options.hfov is not None and not 0.0 < options.hfov < 180.0:
-        raise OptionError(f"--hfov must be between 0 and 180 degrees, got {options.hfov:g}")
-    if options.eye is not None or options.target is not None:
-        if options.eye is None or options.target is None:
-            raise OptionError("--eye and --target go together; give both")
-        if options.camera:
-            raise OptionError("--camera and --eye exclude each other; give one")
+    if options.eye is not None and options.target is not None:
         return Camera.look_at(options.eye, options.target, hfov=options.hfov or 65.0)
     camera: Camera | CameraPath
     if options.camera in scene.cameras:

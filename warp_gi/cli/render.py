@@ -16,6 +16,7 @@ from warp_gi.cli.inputs import (
     BAKE_SUFFIX,
     DEFAULT_SCENE,
     SceneOptions,
+    check_camera_options,
     find_camera,
     find_scene,
     move_sky,
@@ -39,7 +40,7 @@ from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence.chunks import chunk_of, run_of
 from warp_gi.sequence.frame_time import parse_seconds, take_time
 from warp_gi.sequence.frames import parse_frames
-from warp_gi.sequence.resume import Output, Plan, SequenceRun, Shot, shots_of
+from warp_gi.sequence.resume import Output, Plan, SequenceRun, Shot, check_frames, shots_of
 from warp_gi.sequence.video import Video, check_video
 
 DESCRIPTION = """Render a sequence of frames to EXR files with named layers, and PNG previews.
@@ -160,6 +161,7 @@ def run(options: Render, report: Reporter) -> None:
         check_video(options.output)
     output = find_output(options)
     check_targets(options)
+    check_camera_options(options)
     bakes = [load_bake(path) for path in options.bake]
     device = launch.get_device(options.device)
     launch.load_ahead(kernels_of(options.settings), device)
@@ -253,7 +255,9 @@ def find_shots(options: Render, camera: Camera | CameraPath) -> list[Shot]:
 
 def check_targets(options: Render) -> None:
     """Raise before the scene is loaded, for frames that are none and for files that cannot be written."""
-    for index in parse_frames(options.frames) if options.frames else [0]:
+    frames = parse_frames(options.frames) if options.frames else [0]
+    check_frames(frames, options.output)
+    for index in frames:
         path = frame_path(options.output, index)
         if not options.resume or not path.is_file():  # a whole one is kept
             check_target(path)

@@ -65,6 +65,12 @@ def naming_file(path: Path, read: Callable[[], T]) -> T:
         raise SceneError(f"camera path {path}: {error}") from error
 
 
+LENS_FIELDS = ("hfov", "vfov", "lens_shift", "pixel_aspect", "ortho_width")
+"""Fields of a keyframe that K stands for."""
+KEYFRAME_FIELDS = {*LENS_FIELDS, "time", "eye", "target", "up", "K", "world_from_camera", "convention"}
+KEYFRAME_FIELDS |= {"name", "comment"}
+
+
 class _Fields:
     """Fields of an object in the file. Raises ValueError that names the object and the field."""
 
@@ -146,6 +152,16 @@ def _keyframes(document: Mapping[str, Any]) -> CameraFile:
 
 def _camera(key: _Fields, resolution: tuple[int, int]) -> Camera:
     """Return the camera of a keyframe."""
+    unknown = sorted(set(key.values) - KEYFRAME_FIELDS)
+    if unknown:
+        warnings.warn(
+            f"{key.what} of a camera path has {', '.join(map(repr, unknown))}, which nothing reads; known are"
+            f" {', '.join(sorted(KEYFRAME_FIELDS))}",
+            stacklevel=7,
+        )
+    beside = [name for name in LENS_FIELDS if name in key]
+    if "K" in key and beside:
+        raise ValueError(f"{key.what} has K and {beside[0]}, which follows from it; leave one out")
     convention: Any = key.text("convention", "opengl")
     if "K" in key:
         K = key.matrix("K")

@@ -18,6 +18,9 @@ Vector = Sequence[float] | np.ndarray
 
 CONVENTIONS = {"opencv": (1.0, -1.0, -1.0, 1.0), "opengl": (1.0, 1.0, 1.0, 1.0)}
 """Factors on the axes of a camera's space that make it x right, y up, z backward."""
+MOST_LEAN = 0.01
+"""Largest cosine between two axes of a placement, which may be rounded to a few digits."""
+
 LEAST_FOV, MOST_FOV = 1e-3, 179.9999
 """Degrees of a field of view outside which neighbouring pixels have the same float32 direction."""
 FARTHEST = 1e15  # metres; beyond, squares of distances leave float32
@@ -61,11 +64,14 @@ class Camera:
                 f" got {self.world_from_camera!r:.80}"
             ) from error
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-            raise OptionError(f"camera {self.name!r}: world_from_camera must be a finite 4x4 matrix, got {matrix}")
+            raise OptionError(
+                f"camera {self.name!r}: world_from_camera must be a finite 4x4 matrix, got {matrix.tolist()!r:.120}"
+            )
         # whatever the scale of an axis: a power of 2, which changes no digit
         matrix[:3, :3] = np.ldexp(matrix[:3, :3], -np.frexp(np.abs(matrix[:3, :3]).max(axis=0))[1])
         if abs(np.linalg.det(matrix[:3, :3])) < 1e-12:
             raise OptionError(f"camera {self.name!r}: world_from_camera is singular; give three independent axes")
+        check_last_row(matrix, self.name)
         if np.linalg.det(matrix[:3, :3]) < 0:
             raise OptionError(
                 f"camera {self.name!r}: world_from_camera is a reflection (its determinant is negative), which no"
@@ -83,7 +89,9 @@ class Camera:
                 f"camera {self.name!r}: hfov must be from {LEAST_FOV:g} to {MOST_FOV:.4f} degrees, got {self.hfov}"
             )
         if not np.abs(matrix[:3, 3]).max() <= FARTHEST:
-            raise OptionError(f"camera {self.name!r}: its position must be within {FARTHEST:g} m, got {matrix[:3, 3]}")
+            raise OptionError(
+                f"camera {self.name!r}: its position must be within {FARTHEST:g} m, got {matrix[:3, 3].tolist()}"
+            )
         if not (self.pixel_aspect > 0 and math.isfinite(self.pixel_aspect)):
             raise OptionError(f"camera {self.name!r}: pixel_aspect must be finite and above 0, got {self.pixel_aspect}")
         check_number(f"camera {self.name!r}: ortho_width", self.ortho_width)
@@ -126,7 +134,7 @@ class Camera:
         eye: Vector,
         target: Vector,
         up: Vector = (0.0, 1.0, 0.0),
-        hfov: float = 65.0,
+        hfov: float | None = None,
         resolution: tuple[int, int] = (960, 540),
         name: str = "",
         *,
@@ -135,10 +143,13 @@ class Camera:
     ) -> Camera:
         """Return a camera at ``eye`` [m] that looks at ``target`` [m].
 
-        ``vfov`` is the vertical field of view in degrees, in place of ``hfov``, and stays at another resolution.
-        Raises OptionError if eye and target coincide or ``up`` is along the view.
+        ``hfov`` is the horizontal field of view in degrees, 65 by default. ``vfov`` is the vertical one, in place of
+        it, and stays at another resolution. Raises OptionError if eye and target coincide, ``up`` is along the view, or
+        both fields of view are given.
         """
-        camera = cls(_look_at_matrix(eye, target, up), hfov, resolution, name, lens_shift)
+        if hfov is not None and vfov is not None:
+            raise OptionError(f"camera {name!r}: has both hfov and vfov; leave one out")
+        camera = cls(_look_at_matrix(eye, target, up), 65.0 if hfov is None else hfov, resolution, name, lens_shift)
         return camera if vfov is None else camera.with_vfov(vfov)
 
     @classmethod
@@ -200,7 +211,14 @@ class Camera:
         if given.shape not in ((4, 4), (3, 4)):
             raise OptionError(f"camera {name!r}: world_from_camera must be 4x4 or 3x4, got shape {given.shape}")
         placement[: len(given)] = given
+        check_last_row(placement, name)
+        check_axes(placement[:3, :3], name)
         width, height = resolution
+        if max(fx, fy, abs(cx), abs(cy)) < 4.0 and min(width, height) >= 16:
+            raise OptionError(
+                f"camera {name!r}: K must be in pixels of {width}x{height}, got {matrix.tolist()}; multiply its"
+                " first row by the width and its second by the height if it counts in pictures"
+            )
         hfov = 2 * math.degrees(math.atan(0.5 * width / fx))
         shift = (float(0.5 - cx / width), float(cy / height - 0.5))
         axes = np.diag(CONVENTIONS[convention])
@@ -295,6 +313,23 @@ class Camera:
         (fx, _, cx), (_, fy, cy), _ = self.intrinsics
         depth = np.ones((len(local), 1)) if self.is_orthographic else -local[:, 2:]
         return local[:, :2] / depth * [fx, -fy] + np.array([cx, cy])
+
+
+def check_last_row(matrix: np.ndarray, name: str) -> None:
+    """Raise OptionError unless ``matrix`` [4, 4] acts on column vectors, and is no projection."""
+    if np.isfinite(matrix).all() and not np.array_equal(matrix[3], (0.0, 0.0, 0.0, 1.0)):
+        raise OptionError(
+            f"camera {name!r}: the last row of world_from_camera must be 0 0 0 1, got {matrix[3].tolist()};"
+            " transpose a matrix that acts on row vectors"
+        )
+
+
+def check_axes(axes: np.ndarray, name: str) -> None:
+    """Raise OptionError unless the columns of ``axes`` [3, 3] are perpendicular, as those of a placement are."""
+    lengths = np.linalg.norm(axes, axis=0)
+    units = axes / np.where(lengths > 0.0, lengths, 1.0)  # an axis of no length is an error of the camera
+    if np.abs(units.T @ units - np.diag(np.diag(units.T @ units))).max() > MOST_LEAN:
+        raise OptionError(f"camera {name!r}: world_from_camera is sheared: its axes must be perpendicular")
 
 
 def offset_text(offset: Vector) -> str:

@@ -160,17 +160,22 @@ class Plan:
         return "a frame before it is rendered again" if is_after else "the saved state is of a frame before it"
 
 
+def check_frames(frames: Sequence[int], pattern: Path) -> None:
+    """Raise OptionError for several frames that would go to one file."""
+    if len(set(frames)) < len(frames):
+        twice = sorted(index for index in set(frames) if list(frames).count(index) > 1)
+        raise OptionError(f"frame {twice[0]} is asked for twice, and both would go to one file; ask once")
+    if len(frames) > 1 and "#" not in pattern.name:
+        raise OptionError(f"{len(frames)} frames cannot all go to {pattern}; put #### in the name")
+
+
 def shots_of(camera: Camera | CameraPath, frames: Sequence[int], pattern: str | Path) -> list[Shot]:
     """Return frames of a camera in order, each with the file that it goes to.
 
     Raises OptionError for a negative number, or several frames that would go to one file.
     """
     pattern = Path(pattern)
-    if len(set(frames)) < len(frames):
-        twice = sorted(index for index in set(frames) if list(frames).count(index) > 1)
-        raise OptionError(f"frame {twice[0]} is asked for twice, and both would go to one file; ask once")
-    if len(frames) > 1 and "#" not in pattern.name:
-        raise OptionError(f"{len(frames)} frames cannot all go to {pattern}; put #### in the name")
+    check_frames(frames, pattern)
     at = camera.camera if isinstance(camera, CameraPath) else lambda index: camera
     previous = [max(frames[0] - 1, 0), *frames] if frames else []
     return [

@@ -154,6 +154,11 @@ class _Reader:
 
     def _matrix(self, source: Part, owner: str) -> np.ndarray:
         if source.get("matrix") is not None:
+            if {"translation", "rotation", "scale"} & source.keys():
+                self.document.findings.lost.append(
+                    f"{str(self.document.path)!r}: {owner} has a matrix, and translation, rotation or scale as well;"
+                    " the matrix counts"
+                )
             values = self.document.numbers(source, "matrix", owner, (0.0,) * 16)
             return np.array(values, np.float64).reshape(4, 4).T
         rest = {"translation": (0.0,) * 3, "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0,) * 3}

@@ -190,6 +190,10 @@ class Buffers:
         data = self.view(view, name)
         size = width * dtype.itemsize
         stride = self.document.whole(self.document.items("bufferViews")[int(view)], "byteStride", name, 0) or size  # type: ignore[call-overload]
+        if stride < size and count > 1:
+            raise self.document.error(
+                name, f"values of {size} bytes overlap: byteStride of its buffer view is {stride}"
+            )
         needed = offset + stride * (count - 1) + size if count else 0
         if needed > len(data):
             raise SceneError(
