@@ -113,9 +113,8 @@ class FrameScheduler:
         if self.pipeline.denoise is not None:  # first of all: it says if it is not installed
             self._start_part(DENOISER, self.pipeline.denoise)
         self._frames: int | None = None
-        self._bake_seconds, self._baked_version = 0.0, -1
+        self._bake_seconds, self._baked_version, self._scene_hash = 0.0, -1, ""
         self._sky_time = sky_start(self.scene.sky_at)
-        self._scene_hash = ""
         self._frame_time: float | None = None
 
     # ---- before the first frame ----
