@@ -112,10 +112,9 @@ class FrameScheduler:
         if self.pipeline.denoise is not None:  # first of all: it says if it is not installed
             self._start_part(DENOISER, self.pipeline.denoise)
         self._frames: int | None = None
-        self._bake_seconds, self._baked_version = 0.0, -1
+        self._bake_seconds, self._baked_version, self._scene_hash = 0.0, -1, ""
         self._trail: Trail | None = None
         self._sky_time = sky_start(self.scene.sky_at)
-        self._scene_hash = ""
         self._frame_time: float | None = None
 
     def __copy__(self) -> FrameScheduler:

@@ -1,8 +1,11 @@
-"""What saved states of the sample octree, the light cache and guided paths have to be, before a kernel follows them."""
+"""What saved states of the sample octree, the light cache and guided paths have to be, before a kernel follows them.
+
+States are ``Any`` here: their modules import this one.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -10,16 +13,11 @@ from warp_gi.kernels import octree as octree_kernels
 from warp_gi.kernels import quadtree as quadtree_kernels
 from warp_gi.layout import Layout, misfit
 
-if TYPE_CHECKING:
-    from warp_gi.techniques.reuse.guided_paths import GuideState
-    from warp_gi.techniques.reuse.light_cache import CacheState
-    from warp_gi.techniques.reuse.sample_octree import OctreeState
-
 MOST = 1e30
 """Largest number of a state."""
 
 
-def octree_fault(state: OctreeState) -> str:
+def octree_fault(state: Any) -> str:
     """Return why the nodes are no octree, level by level as it is built; "" if they are."""
     nodes = _array(state.octree.nodes)
     count = len(nodes)
@@ -55,7 +53,7 @@ def leaf_places(nodes: np.ndarray) -> np.ndarray:
     return ((nodes[:, None] >> np.arange(8, dtype=np.uint32)) & 1).astype(bool).ravel()
 
 
-def guide_fault(state: GuideState, before: GuideState, octree: OctreeState | None) -> str:
+def guide_fault(state: Any, before: Any, octree: Any) -> str:
     """Return why quadtrees are none, or do not fit the octree; "" if they do. ``before`` is the state of no frame."""
     if octree is None:
         return "it has no octree"
@@ -116,7 +114,7 @@ def _quadtree_fault(trees: np.ndarray, counts: np.ndarray, bits: int) -> str:
     return "counts of its quadtrees are not theirs" if (expected != counts).any() else ""
 
 
-def cache_fault(state: CacheState, before: CacheState, octree: OctreeState | None) -> str:
+def cache_fault(state: Any, before: Any, octree: Any) -> str:
     """Return why lists of lights are none, or do not fit octree and scene; "" if they do."""
     if octree is None:
         return "it has no octree"
