@@ -136,7 +136,7 @@ def test_a_picture_that_does_not_fit_is_one_line(tmp_path, monkeypatch, capfd):
     error = capfd.readouterr().err
     assert error.count("\n") == 1 and not (tmp_path / "o").exists()
     assert (
-        "a picture of 2000x1000 takes about 0.9 GB of memory (430 bytes a pixel), and 0.5 GB are free on cpu" in error
+        "a picture of 2000x1000 takes about 0.9 GB of memory (470 bytes a pixel), and 0.5 GB are free on cpu" in error
     )
     camera = gi.Camera.look_at((0, 1, 3), (0, 1, 0), resolution=(2000, 1100))
     with pytest.raises(OptionError, match="245 bytes a pixel"):
@@ -161,13 +161,13 @@ def test_what_a_container_may_take_counts(tmp_path, monkeypatch):
 
 
 def test_a_frame_keeps_no_more_than_is_asked_for():
-    """Sums of squares go when the variance is there, hits when a denoiser begins, and guides that no frame reads."""
+    """Sums of squares go when the variance is there, and guides that no frame reads; hits are for who draws them."""
     scene = gi.builtin_scene("cornell_box")
     camera = gi.Camera.look_at((0, 1, 3), (0, 1, 0), resolution=(8, 8))
     scheduler = gi.FrameScheduler(scene, camera, gi.Pipeline(spp=1, denoise=gi.SpatioTemporal()))
     frame = scheduler.frame(0)
     assert not any("moment" in name for name in frame._arrays)
-    assert frame.hits.face is None or len(frame.hits.face) == 0
+    assert len(frame.hits.face) == 64
     guides = scheduler.state("denoise").guides
     held = {name for name in denoise.Guides.vars if len(getattr(guides, name))}
-    assert held == {"guide_object", "guide_normal", "guide_position"}
+    assert held == {"guide_object", "guide_normal", "guide_position", "guide_reflected"}

@@ -257,7 +257,6 @@ class Frame:
     def keep_noisy(self) -> None:
         """Make the composed beauty the buffer "noisy", and an empty beauty for a denoiser to fill."""
         self._forget_moments()
-        self.hits = gbuffer.PrimaryHits()  # 28 bytes a pixel, which light was gathered for
         self._arrays["noisy"] = self._arrays["beauty"]
         self._arrays["beauty"] = wp.empty_like(self._arrays["noisy"])
 

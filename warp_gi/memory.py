@@ -13,7 +13,7 @@ from warp_gi.errors import OptionError, SceneError
 if TYPE_CHECKING:
     import warp as wp
 
-PLAIN_BYTES, DENOISED_BYTES = 245, 430
+PLAIN_BYTES, DENOISED_BYTES = 245, 470
 """Bytes that a pixel takes at most while a sequence is rendered and written, without and with a denoiser (measured)."""
 _GROUPS = (
     ("/sys/fs/cgroup", "memory.max", "memory.current", "file"),

@@ -443,7 +443,7 @@ def test_compare_refuses(unbroken, tmp_path, capsys):
     for a, b, extra, words in [
         (small, png, [], "image is 4x4 with 3 channels and reference 24x16"),
         (exr, png, [], "give two of a kind"),
-        (tmp_path / "text.png", png, [], "not a picture"),
+        (tmp_path / "text.png", png, [], "text.png cannot be read as an image"),
         (tmp_path / "objects.npy", exr, [], "not a NumPy array"),
         (exr, exr, ["--layer", "shadow"], "no layer 'shadow'"),
         (exr, exr, ["-o", "d.gif"], ".png or an .exr"),

@@ -120,7 +120,7 @@ READ_GUIDES = ("guide_object", "guide_normal", "guide_position", "guide_reflecte
 
 
 def read_guides(guides: denoise.Guides) -> denoise.Guides:
-    """Return guides with nothing but what the next frame reads: 28 of 88 bytes a pixel."""
+    """Return guides with nothing but what the next frame reads: 32 of 96 bytes a pixel."""
     kept = _empty(denoise.Guides, guides.guide_object.device)
     for name in READ_GUIDES:
         setattr(kept, name, getattr(guides, name))
