@@ -59,7 +59,7 @@ HEADLINES = (
         "TriangleBvh",
         "finds what rays hit",
         Text(
-            "{fast} times as many rays per second as Embree 4 by default, {robust} times as many as its watertight "
+            "{fast} times as many rays per second as Embree 4's default tree, {robust} times as many as its watertight "
             "mode",
             {"fast": Figure("ours / embree"), "robust": Figure("ours / embree robust")},
             "rays",
