@@ -101,6 +101,7 @@ class PathSettings:
     spp: wp.int32  # paths of a pixel in all of the frame
     lobes: wp.int32  # 1: light is parted by the lobe of the first vertex that reflects it
     cache_vertex: wp.int32  # from which on paths may end in a radiance cache: 1 is the first hit; unused without one
+    hides_sky: wp.float32  # 1: pictures have no background
 
 
 # Radiance of one path, by term; and by the lobe of the first vertex that reflects it, if asked for, but for what a
@@ -570,7 +571,7 @@ def _made(
         direction = hits.direction[pixel]
         count = wp.float32(settings.sample_count)
         if face < 0:
-            background = sky.radiance(samplers.sky, scene, direction)
+            background = sky.radiance(samplers.sky, scene, direction) * (1.0 - paths.hides_sky)
             add_moments(buffers, pixel, of_layers(buffers, pixel, background), count)
             return
         drawn = surface_emission(scene, face, hits.u[pixel], hits.v[pixel], -direction)

@@ -333,6 +333,7 @@ class Frame:
         settings.roulette_depth, settings.clamp = request.roulette_depth, request.clamp
         settings.sky_probability, settings.spp = self.sky_probability, self.settings.spp
         settings.cache_vertex, settings.lobes = request.cache_vertex, int(self.lobes() is not None)
+        settings.hides_sky = float(not self.settings.background)
         tracer = path_trace.path_tracer(*request.samplers(), tints=self.data.panes.count > 0)
         samplers = tracer.samplers()
         for name in tracer.samplers.vars:

@@ -113,3 +113,20 @@ def test_the_command_line(tmp_path):
 def test_bakes_alone_always_show_their_sky():
     with pytest.raises(OptionError, match="always shows the sky of its bake"):
         gi.Pipeline.preset("probe_view", background=False)
+
+
+def test_a_sky_that_is_not_shown_adds_nothing_to_the_variance():
+    """At the edge of a lamp pictures without a background have the variance of a lamp without a sky."""
+    lamp = gi.Material(base_color=(0, 0, 0), specular=0, emission=(1.0, 2.0, 3.0))
+    variances = []
+    for sky, background in ((5.0, False), (None, True), (5.0, True)):
+        scene = half_plane()
+        scene = gi.Scene(
+            [gi.Node("lamp", [gi.Mesh(m.points, m.indices, lamp)]) for m in scene.nodes[0].meshes], environment=sky
+        )
+        pipeline = gi.Pipeline(spp=SAMPLES, camera_samples=SAMPLES, background=background)
+        (frame,) = gi.render(scene, CAMERA, pipeline)
+        variances.append(frame.numpy("variance").copy())
+    cut, alone, full = variances
+    np.testing.assert_allclose(cut, alone, rtol=1e-5, atol=1e-9)
+    assert cut.max() > 0 and not np.allclose(cut, full)
