@@ -157,6 +157,7 @@ BINARY = """
             const float* right = all_costs + 8ll * (n + 2 * left_count);
             for (int roots = 2; roots <= 8; ++roots) {
                 float best = 3.4e38f;
+                choice[roots - 1] = 1;  // where no cost is finite
                 for (int k = 1; k < roots; ++k) {
                     const float c = left[k - 1] + right[roots - k - 1];
                     if (c < best) best = c, choice[roots - 1] = (unsigned char)k;
@@ -165,8 +166,8 @@ BINARY = """
             }
             const int count = word(nodes[n].low);
             const float block = count <= LANES ? area * BLOCK_COST : 3.4e38f, inner = area * NODE_COST + costs[7];
-            choice[0] = inner < block;
-            costs[0] = inner < block ? inner : block;
+            choice[0] = count > LANES || inner < block;
+            costs[0] = choice[0] ? inner : block;
             costs[7] = left[7] + right[7];
             for (int i = 1; i < 7; ++i) if (!(costs[i] < costs[i - 1])) costs[i] = costs[i - 1], choice[i] = 0;
         }

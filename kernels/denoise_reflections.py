@@ -131,7 +131,7 @@ def reproject_reflections(
     if bent <= 1.0 / FAR:
         bent = 1.0 / FAR
     behind = 1.0 / bent
-    image = place + view * behind
+    image = place + view * (behind * views.now.spread)  # orthographic rays are parallel: no way along them moves it
     was = image + (moved - 2.0 * wp.dot(moved, normal) * normal) * (behind / t)
     was = was + 2.0 * wp.dot(now.guide_previous[i] - place, normal) * normal
     motion = project(views.before, was - views.before.position) - project(views.now, image - views.now.position)

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from warp_gi import launch, wide_tree
-from warp_gi.errors import SceneError, unknown_name
+from warp_gi.errors import SceneError, check_near, unknown_name
 from warp_gi.kernels import bvh_native as layout
 from warp_gi.kernels import bvh_rays as batch
 from warp_gi.kernels import types
@@ -285,6 +285,7 @@ def _checked_points(points: object) -> np.ndarray:
     if not np.isfinite(positions).all():
         bad = int(np.flatnonzero(~np.isfinite(positions).all(axis=1))[0])
         raise SceneError(f"vertex positions must be finite, but vertex {bad} is {positions[bad].tolist()}")
+    check_near(positions)
     return positions
 
 

@@ -3,9 +3,20 @@
 from __future__ import annotations
 
 import difflib
+import errno
 from collections.abc import Iterable
 from numbers import Integral
+from typing import TYPE_CHECKING
 
+if TYPE_CHECKING:
+    import numpy as np
+
+FARTHEST = 1e15
+"""Metres from the origin beyond which squares of distances leave float32."""
+FARTHEST_VERTEX = 1e12
+"""Metres beyond which products of three lengths leave float32, by which rays are tested against triangles."""
+OF_MACHINE = {"ENOSPC", "EDQUOT", "EIO", "ENOMEM", "ESTALE", "EMFILE", "ENFILE", "EPIPE", "ETIMEDOUT"}
+"""Errors of the system that no argument is to blame for."""
 MOST_NAMES = 64
 """Known names that an error lists."""
 
@@ -67,3 +78,24 @@ def check_number(name: str, value: object) -> None:
     """Raise OptionError unless a setting is a number."""
     if isinstance(value, str | bytes) or not hasattr(value, "__float__"):
         raise OptionError(f"{name} must be a number, got {value!r:.80}")
+
+
+def check_near(points: np.ndarray) -> None:
+    """Raise SceneError for positions beyond ``FARTHEST_VERTEX``, float32 [vertex, 3]."""
+    if len(points) and max(points.max(), -points.min()) > FARTHEST_VERTEX:
+        bad = int(abs(points).max(axis=1).argmax())
+        raise SceneError(
+            f"vertices must be within {FARTHEST_VERTEX:g} m, but vertex {bad} is at {points[bad].tolist()}; scale down"
+        )
+
+
+def is_of_machine(error: BaseException) -> bool:
+    """Return whether another try may do better: memory or disk ran out, or a library could not write a file."""
+    if isinstance(error, OSError):
+        return error.errno is None or errno.errorcode.get(error.errno) in OF_MACHINE
+    return isinstance(error, MemoryError)
+
+
+def is_mistake(error: BaseException) -> bool:
+    """Return whether what was asked for cannot be, so that another try would fail, too."""
+    return isinstance(error, GiError | OSError) and not is_of_machine(error)

@@ -338,6 +338,9 @@ class Frame:
         samplers = tracer.samplers()
         for name in tracer.samplers.vars:
             setattr(samplers, name, getattr(request, name).data)
+        for name in ("moment1", "moment2"):  # a frame that was done has none left
+            if name not in self._arrays:
+                self._arrays[name] = wp.zeros_like(self._arrays["indirect"])
         buffers = self.struct(path_trace.PathBuffers)
         inputs = [self.data, self.camera_data, self.pass_settings, settings, self.hits, buffers, samplers]
         self.launch_tiled(tracer.trace_paths, inputs)

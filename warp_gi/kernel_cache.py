@@ -7,6 +7,7 @@ that changed on a disk are found before they run.
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
 import logging
@@ -89,7 +90,7 @@ def _naming(folder: Path) -> Iterator[None]:
 def _unwritable(folder: object, error: OSError) -> OSError:
     reason = error.strerror or one_line(error)
     problem = f"compiled kernels are kept in this folder, and that failed ({reason}); name another by {VARIABLE}"
-    return OSError(error.errno or 0, problem, str(folder))
+    return OSError(error.errno or errno.EIO, problem, str(folder))
 
 
 def _sums(folder: Path) -> dict[str, str]:

@@ -12,7 +12,6 @@ and of others. CUDA does not work there once the parent has started it: an error
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import itertools
 import os
@@ -167,9 +166,11 @@ def _load_here(kernel: wp.Kernel, device: wp.Device) -> None:
     with loading.lock_of(kernel.module.name):
         loading.prepare(kernel.module)
         block = 1 if device.is_cpu else CUDA_BLOCK
-        is_loaded = (kernel.module.name, device.alias) in _loaded
-        with contextlib.nullcontext() if is_loaded else loading.alone(kernel, block):
-            kernel_cache.load(kernel.module, device, block)
+        if (kernel.module.name, device.alias) in _loaded:
+            kernel.module.load(device, block)
+        else:
+            with loading.alone(kernel, block):
+                kernel_cache.load(kernel.module, device, block)
     with _counting:
         compile_cpu_seconds += time.thread_time() - cpu
 

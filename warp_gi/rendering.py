@@ -101,8 +101,10 @@ def render(
         raise OptionError(
             'resume, precision, preview, exposure, chunk and cluster are of files; give output="out/shot.####.exr" too'
         )
-    if cluster is not None and (chunk or frame_time is not None):
-        raise OptionError("a cluster hands out whole sequences of a number of samples; leave chunk and frame_time out")
+    if cluster is not None and (chunk or frame_time is not None or skip):
+        raise OptionError("a cluster hands out whole sequences; leave chunk, frame_time and skip out")
+    if cluster is not None and not Output(Path(str(output))).is_exr:
+        raise OptionError(f"a cluster writes .exr files, which say how they were made, got {str(output)!r}")
     bakes = tuple(bakes)
     part = chunk_of(chunk, warm_up, frame_time)
     if frame_time is not None:

@@ -10,6 +10,7 @@ from ray_tools import oracle, rays, soup
 import warp_gi as gi
 from warp_gi import bvh as bvh_module
 from warp_gi.bvh import AlphaMasks, TriangleBvh
+from warp_gi.errors import SceneError
 from warp_gi.kernels import bvh as queries
 from warp_gi.kernels import bvh_rays, types
 from warp_gi.launch import launch
@@ -509,3 +510,24 @@ def test_bad_rays_and_devices_are_one_clear_line():
         TriangleBvh(good, [[0, 1, 2]], alpha=AlphaMasks(np.int32([0, 0]), [(-1, 1, 1)], np.zeros((4, 2)), *textures))
     with pytest.raises(gi.SceneError, match="texture 3"):
         TriangleBvh(good, [[0, 1, 2]], alpha=AlphaMasks(np.int32([0]), [(3, 1, 1)], np.zeros((4, 2)), *textures))
+
+
+@pytest.mark.parametrize("far", [1e13, -1e20, 3e38])
+def test_vertices_past_what_boxes_can_hold_are_refused(far):
+    """Areas of such boxes are infinite, and trees of them were written past the end of their memory."""
+    points = np.random.default_rng(1).uniform(-1, 1, (300, 3)).astype(np.float32)
+    points[17, 1] = far
+    faces = np.arange(300, dtype=np.int32).reshape(-1, 3)
+    with pytest.raises(SceneError, match=r"within 1e\+12 m, but vertex 17"):
+        TriangleBvh(points, faces)
+    with pytest.raises(SceneError, match=r"within 1e\+12 m"):
+        gi.Scene([gi.Node("far", [gi.Mesh(points, faces)])])
+
+
+def test_the_farthest_vertices_are_found():
+    points = np.random.default_rng(1).uniform(-1e12, 1e12, (300, 3)).astype(np.float32)
+    tree = TriangleBvh(points, np.arange(300, dtype=np.int32).reshape(-1, 3))
+    middles = points.reshape(-1, 3, 3).mean(axis=1)
+    eye = np.float32([0, 0, 9e12])
+    ways = (middles - eye) / np.linalg.norm((middles - eye).astype(np.float64), axis=1, keepdims=True)
+    assert (tree.intersect(np.repeat(eye[None], 100, 0), np.float32(ways)).face.numpy() >= 0).all()

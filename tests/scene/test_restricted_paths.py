@@ -142,3 +142,24 @@ def test_nodes_nested_deeper_than_any_stack(tmp_path, is_animated):
     np.testing.assert_allclose(scene.world_from_node(count - 1, 0.0)[:3, 3], [start, 0, 0], atol=1e-4)
     if is_animated:
         np.testing.assert_allclose(scene.world_from_node(count - 1, 0.5)[:3, 3], [start + 0.5, 0, 0], atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["~/../secret.png", "C:/../secret.png", "~secret.png"])
+def test_maps_with_names_of_another_machine_are_not_looked_for_outside(tmp_path, monkeypatch, name):
+    """Such names are tried from the working directory, where an archive may have brought folders of that name."""
+    inside, outside = tmp_path / "scene", tmp_path / "work"
+    for folder in (inside, outside, outside / "~", outside / "C:"):
+        folder.mkdir()
+    for place in (outside / "secret.png", outside / "~secret.png"):
+        Image.new("RGB", (2, 2), (255, 0, 0)).save(place)
+    path = scene_naming(inside, "map", name)
+    monkeypatch.chdir(outside)
+    with pytest.raises(SceneError, match="restrict"):
+        gi.load_scene(path, restrict_paths=True)
+
+
+def test_no_program_is_started_for_a_texture(tmp_path):
+    """Pillow gives PostScript to Ghostscript; here it is no image, whatever it is called."""
+    (tmp_path / "a.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 2 2\n%%EndComments\nshowpage\n")
+    with pytest.raises(SceneError, match="cannot be read as an image"):
+        gi.load_scene(scene_naming(tmp_path, "map", "a.png"))

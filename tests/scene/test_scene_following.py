@@ -492,3 +492,44 @@ def test_memory_of_trails_is_given_back():
         scene.set_points(scene.nodes[0], scene.nodes[0].meshes[0].points + np.float32(0.01))
         list(gi.render(scene, CAMERA, DIRECT))
     assert len(scene._devices["cpu"].trails) == 1
+
+
+def test_every_owner_of_an_array_is_told_of_its_edit():
+    """Two meshes may have one array of points, and two textures one of pixels: all of them show an edit in place."""
+    points = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    pixels = np.zeros((2, 2, 4), np.uint8)
+    pixels[..., 3] = 255
+    first, second = gi.Texture("first", pixels), gi.Texture("second", pixels)
+    uvs = np.zeros((3, 2), np.float32)
+    plain = gi.Material("plain", base_color_texture=first)
+    lamp = gi.Material("lamp", emission=(1, 1, 1), emission_texture=second)
+    faces = np.int32([[0, 1, 2]])
+    meshes = [gi.Mesh(points, faces, material, uvs=uvs, name=material.name) for material in (plain, lamp)]
+    scene = gi.Scene([gi.Node(mesh.name, [mesh]) for mesh in meshes])
+    scene.data("cpu")
+    pixels[..., :3] = 200
+    scene.check_unchanged()
+    assert scene.emitter_count == gi.Scene(scene.nodes).emitter_count == 1
+    points[1, 0] = 3.0
+    scene.check_unchanged()
+    assert np.array_equal(scene._flat.points, gi.Scene(scene.nodes)._flat.points)
+    assert (scene._flat.points[:, 0] == 3.0).sum() == 2
+
+
+def test_a_lamp_that_opens_later_and_is_lit_by_an_edit_is_among_the_lights():
+    keys = [gi.Keyframe(0.0, scale=(0.0, 0.0, 0.0)), gi.Keyframe(1.0)]
+    dark = gi.Material("lamp")
+    mesh = gi.Mesh(np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.int32([[0, 1, 2]]), dark)
+    scene = gi.Scene([gi.Node("lamp", [mesh], keyframes=keys)])
+    scene.data("cpu")
+    dark.emission = (5.0, 5.0, 5.0)
+    scene.check_unchanged()
+    assert scene.emitter_count == 1 and scene.hash == gi.Scene(scene.nodes).hash
+
+
+def test_nodes_that_come_are_one_line():
+    scene = gi.Scene([gi.Node("one", [gi.Mesh(np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.int32([[0, 1, 2]]))])])
+    scene.data("cpu")
+    scene.nodes.append(gi.Node("empty"))
+    with pytest.raises(gi.SceneError, match="node 'empty' was added"):
+        scene.check_unchanged()

@@ -26,7 +26,7 @@ from cluster_tools import workers
 from warp_gi.cli import cluster
 from warp_gi.cluster import engine
 from warp_gi.cluster.identity import Identity
-from warp_gi.cluster.worker import Admission
+from warp_gi.cluster.worker import admit
 
 SIZE = (64, 36)
 PIPELINES = {
@@ -122,9 +122,8 @@ def test_another_version_is_refused_by_name(two, caplog):
     async def set_resources(**resources):
         given.append(resources)
 
-    for identity in (other, Identity.mine()):
-        asyncio.run(Admission(identity).setup(SimpleNamespace(set_resources=set_resources)))
-    assert given == [{other.resource: 0.0}, {Identity.mine().resource: 1.0}] and len({*given[0], *given[1]}) == 2
+    asyncio.run(admit(Identity.mine().resource, SimpleNamespace(set_resources=set_resources)))
+    assert given == [{Identity.mine().resource: 1.0}] and other.resource != Identity.mine().resource
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import importlib
 import io
 import os
@@ -12,15 +11,13 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from warp_gi.errors import GiError, one_line, unknown_name
+from warp_gi.errors import GiError, is_of_machine, one_line, unknown_name
 
 EXIT_FAILURE = 1
 """A run failed through no fault of its arguments: a full disk, no memory, a fault of this program. Again may help."""
 EXIT_ERROR = 2
 """What was asked for cannot be: another try would fail, too."""
 EXIT_INTERRUPTED = 130
-OF_MACHINE = {"ENOSPC", "EDQUOT", "EIO", "ENOMEM", "ESTALE", "EMFILE", "ENFILE", "EPIPE", "ETIMEDOUT"}
-"""Errors of the system that no argument is to blame for."""
 DEBUG = "WARP_GI_DEBUG=1 shows where it came from"
 
 
@@ -82,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if os.environ.get("WARP_GI_DEBUG", "0") != "0":
             raise
         print(f"warp-gi: error: {_message(error)}", file=sys.stderr)
-        return EXIT_FAILURE if _is_of_machine(error) else EXIT_ERROR
+        return EXIT_FAILURE if is_of_machine(error) else EXIT_ERROR
     except Exception as error:
         if os.environ.get("WARP_GI_DEBUG", "0") != "0":
             raise
@@ -127,13 +124,6 @@ def _dispatch(arguments: list[str]) -> int:
 
 def _show_warning(message: Warning | str, *where: object, **more: object) -> None:
     print(f"warp-gi: warning: {_message(message)}", file=sys.stderr)
-
-
-def _is_of_machine(error: BaseException) -> bool:
-    """Return whether another try may do better: memory or disk ran out, or a library could not write a file."""
-    if isinstance(error, OSError):
-        return error.errno is None or errno.errorcode.get(error.errno) in OF_MACHINE
-    return isinstance(error, MemoryError)
 
 
 def _message(error: BaseException | str) -> str:

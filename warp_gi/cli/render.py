@@ -155,6 +155,8 @@ def run(options: Render, report: Reporter) -> None:
     chunk = chunk_of(options.chunk, options.warm_up, frame_time)
     if options.cluster and (chunk or frame_time or options.reuse_pictures):
         raise OptionError("--cluster goes without --chunk, --frame-time and --reuse-pictures; leave them out")
+    if options.cluster and options.output.suffix.lower() != ".exr":
+        raise OptionError(f"--cluster needs .exr files, which say how they were made, got {options.output}")
     if options.video:
         if chunk is not None:
             raise OptionError("--video needs all frames, and a chunk has some; run warp-gi video when all are there")
@@ -196,9 +198,9 @@ def run(options: Render, report: Reporter) -> None:
         if not plan.todo:
             raise OptionError("--reuse-pictures needs a frame to render, and all are there already; leave --resume out")
         check_writable(options.reuse_pictures)
-    sequence.prepare(plan)
     started = time.perf_counter()
     try:
+        sequence.prepare(plan)
         times: dict[str, list[float]] = {}
         if options.cluster:
             if plan.todo:

@@ -1,7 +1,7 @@
 """Hands frames out to the workers of a Dask scheduler, and says what comes back.
 
 Dask decides which worker gets which frame, and gives the frames of a worker that is killed to others. What is here is
-who may render (``Admission``), how many frames are under way at once, and what is said when something fails.
+who may render (``admit``), how many frames are under way at once, and what is said when something fails.
 """
 
 from __future__ import annotations
@@ -130,9 +130,6 @@ class Cluster:
         Raises OptionError for a frame that no worker can render, OSError for one that failed, or if the scheduler goes
         away: finished frames stay in their files.
         """
-        from warp_gi.cluster.worker import Admission
-
-        self._ask(lambda: self.client.register_plugin(Admission(self.job.identity)))
         self._waiting = deque(places)
         try:
             self.look()
@@ -210,11 +207,20 @@ class Cluster:
             (self._refused if problem else self.workers).add(address)
             if problem:
                 _LOG.info("worker %s is not used: it has %s", address, problem)
+        self._admit([address for address in told if address in self.workers])
         if self._flying:
             self._send_again()
         if not self.workers and not self._said_none:
             self._said_none = True
             _LOG.info("no worker that can render is there; waiting for one (dask worker %s)", self._address)
+
+    def _admit(self, workers: Sequence[str]) -> None:
+        """Give workers one of the resource that a frame takes."""
+        from warp_gi.cluster.worker import admit
+
+        if workers:
+            run, resource = self.client.run, self.job.identity.resource
+            self._ask(lambda: run(admit, resource, workers=workers, on_error="return"))
 
     def _ask(self, call: Callable[[], Any]) -> Any:
         """Return what a call returns, again if a worker dies meanwhile; raises OSError if the scheduler is gone."""

@@ -13,12 +13,12 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from distributed import WorkerPlugin, get_worker
+from distributed import get_worker
 
 from warp_gi import launch
-from warp_gi.cluster.identity import Identity, host
+from warp_gi.cluster.identity import host
 from warp_gi.cluster.job import Job
-from warp_gi.errors import GiError, one_line
+from warp_gi.errors import GiError, is_mistake, one_line
 from warp_gi.files import remove_stale_parts
 from warp_gi.sequence.chunks import PartRun
 from warp_gi.sequence.resume import SequenceRun
@@ -42,17 +42,12 @@ class Done:
     """Whether another try would fail, too."""
 
 
-class Admission(WorkerPlugin):
-    """Gives workers that make the same frames one of the resource that a frame takes: so they get one at a time."""
+async def admit(resource: str, dask_worker: Any) -> None:
+    """Give a worker that makes the same frames one of the resource that a frame takes: so it gets one at a time.
 
-    def __init__(self, identity: Identity) -> None:
-        self.identity = identity
-        self.name = identity.resource
-
-    async def setup(self, worker: Any) -> None:
-        """Let a worker that has just come render, if its versions and its processor are the right ones."""
-        same = not self.identity.differences(Identity.mine())
-        await worker.set_resources(**{self.identity.resource: 1.0 if same else 0.0})
+    It is no plugin: Dask would load that on workers that have no warp_gi, and on those of later jobs.
+    """
+    await dask_worker.set_resources(**{resource: 1.0})
 
 
 class _Bench:
@@ -107,7 +102,7 @@ def render_place(job: Job, place: int) -> Done:
             return Done(place, worker.address, host(), seconds if is_new else 0.0)
         except Exception as error:
             told = str(error) if isinstance(error, GiError | OSError) else f"{type(error).__name__}: {error}"
-            return Done(place, worker.address, host(), 0.0, one_line(told), isinstance(error, GiError))
+            return Done(place, worker.address, host(), 0.0, one_line(told), is_mistake(error))
 
 
 def same(job: Job) -> Job:

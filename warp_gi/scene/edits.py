@@ -66,6 +66,7 @@ class Edits:
         """What is to be followed; an interrupt may leave it half done."""
         self.edited_nodes: set[int] = set()
         self.edited_textures: list[Texture] = []
+        self.has_other_images = False
         self.lets_rays_pass = False
         self.watches: dict[str, Watch] = {}
         self.lights: bytes | None = None
@@ -109,7 +110,8 @@ class Edits:
         if not self.scene._devices:  # materials are read later
             self.scene._digests.forget("geometry", "images", "light")
         if not self.pending:
-            self.edited_nodes, self.edited_textures, self.lets_rays_pass = set(), [], False
+            self.edited_nodes, self.edited_textures = set(), []
+            self.has_other_images = self.lets_rays_pass = False
         edits = [self._edit(change) for some in changes.values() for change in some] + [self._sky_edit()]
         if not self.scene._devices:
             edits.append(self._emission_edit())
@@ -134,7 +136,7 @@ class Edits:
         if "shape" in pending:
             following.reshape(scene, self.edited_nodes)
         if pending & {"materials", "emission"}:
-            following.shade(scene, self.edited_textures, self.lets_rays_pass)
+            following.shade(scene, self.edited_textures, self.has_other_images, self.lets_rays_pass)
         if pending & {"lights", "emission"}:
             following.relight(scene)
         if "sky" in pending:
@@ -167,9 +169,6 @@ class Edits:
         """Return whether nodes were added, removed or replaced."""
         now, old = self.scene.nodes, self.nodes
         if len(now) != len(old):
-            is_longer = len(now) > len(old) and not watched.missing(old, now[: len(old)])
-            if is_longer and not self.scene.is_animated and not any(node.meshes for node in now[len(old) :]):
-                return None
             return Edit(f"node {watched.come_or_gone(now, old)}")
         edits = []
         for index, (node, former) in enumerate(zip(now, old, strict=True)):
@@ -314,6 +313,7 @@ class Edits:
             self.lets_rays_pass |= passes_rays(data, row) or material.lets_rays_pass
             if any(field.startswith(textures.TEXTURE_SLOTS) for field in fields):
                 self.edited_textures += textures.distinct_textures([material])
+                self.has_other_images = True
             emits = any(field.startswith(EMITTING) for field in fields)
             return Edit(f"{fields[0]} of {material.name!r}", follow="emission" if emits else "materials")
         for _, mesh, slot in self._meshes():

@@ -138,6 +138,7 @@ def relight(scene: SceneContents) -> None:
     """
     for light in scene.lights:
         emitters.check_light(light, scene.nodes)
+    set_areas(scene)
     scene._emissive, scene._light_grids = lights_of(scene)
     scene._digests.forget("light")
     for device in scene._devices.values():
@@ -145,12 +146,14 @@ def relight(scene: SceneContents) -> None:
     scene.version += 1
 
 
-def shade(scene: SceneContents, edited: Sequence[Texture], lets_rays_pass: bool) -> None:
+def shade(scene: SceneContents, edited: Sequence[Texture], has_other_images: bool, lets_rays_pass: bool) -> None:
     """Take over edits of materials and of the textures ``edited``.
 
-    ``lets_rays_pass`` says that a material which lets rays pass is among them, or did before.
+    ``has_other_images`` says that textures were edited, added or removed; ``lets_rays_pass`` that a material which lets
+    rays pass is among those edited, or did before.
     """
-    scene._digests.forget("light", *(["geometry"] if lets_rays_pass else []), "images")
+    changed = {"geometry": lets_rays_pass, "images": has_other_images}
+    scene._digests.forget("light", *(name for name, is_other in changed.items() if is_other))
     for device in scene._devices.values():
         device.shade(edited, lets_rays_pass)
     scene.version += 1

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 import warp as wp
 
-from warp_gi.errors import OptionError, check_number, unknown_name
+from warp_gi.errors import FARTHEST, OptionError, check_number, unknown_name
 from warp_gi.kernels import gbuffer
 
 Vector = Sequence[float] | np.ndarray
@@ -23,7 +23,6 @@ MOST_LEAN = 0.01
 
 LEAST_FOV, MOST_FOV = 1e-3, 179.9999
 """Degrees of a field of view outside which neighbouring pixels have the same float32 direction."""
-FARTHEST = 1e15  # metres; beyond, squares of distances leave float32
 LARGEST_SIDE = 1 << 16  # pixels; their Morton code has 16 bits an axis
 LARGEST_COUNT = 1 << 30  # pixels; kernels count them in int32
 

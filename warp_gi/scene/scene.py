@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warp_gi.errors import SceneError, unknown_name
+from warp_gi.errors import SceneError, check_near, unknown_name
 from warp_gi.forks import Guard
 from warp_gi.kernels import types
 from warp_gi.launch import get_device
@@ -93,6 +93,7 @@ class Scene:
         self._hulls = hulls.hulls_of(self.nodes, self._moving)
         if not np.isfinite(self._flat.points).all():
             raise SceneError(f"scene {self.name!r}: node transforms move vertices past the range of float32")
+        check_near(self._flat.points)
         following.set_areas(self)
         self._emissive, self._light_grids = following.lights_of(self)
         self._bounds = following.bounds_of(self)

@@ -52,12 +52,18 @@ class Watch:
         self._lists: list[tuple[Change, list[object], list[object]]] = []
         self._arrays: list[tuple[Change, np.ndarray]] = []
         self._others: list[tuple[Change, object, int]] = []
-        seen: set[int] = set()
+        self._shared: dict[tuple[int, str], list[Change]] = {}  # others that have what a field has
+        seen: dict[int, Change] = {}
         for (owner, names, _), values in zip(self._owners, self._values, strict=True):
             for name, value in zip(names, values, strict=True):
-                if not isinstance(value, _PLAIN) and id(value) not in seen:
-                    seen.add(id(value))
-                    self._add(Change(owner, name), value, bare)
+                if isinstance(value, _PLAIN):
+                    continue
+                change = Change(owner, name)
+                first = seen.setdefault(id(value), change)
+                if first is change:
+                    self._add(change, value, bare)
+                else:
+                    self._shared.setdefault((id(first.owner), first.field), []).append(change)
         self._sums = None if bare else _Checksums([array for _, array in self._arrays])
 
     def _add(self, change: Change, value: object, bare: bool) -> None:
@@ -90,7 +96,7 @@ class Watch:
         found += [change for change, value, crc in self._others if _crc(value) != crc]
         if self._sums is not None:
             found += [self._arrays[index][0] for index in self._sums.changed()]
-        return found
+        return found + [other for one in found for other in self._shared.get((id(one.owner), one.field), ())]
 
 
 class _Checksums:

@@ -11,6 +11,7 @@ import struct
 import warnings
 import zlib
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,9 +24,9 @@ from warp_gi.memory import check_memory
 if TYPE_CHECKING:
     from PIL import Image
 
-MOST_TEXELS = 1 << 27
-"""Largest number of pixels of a texture's file: 16384 x 8192."""
-_LIMIT = f"at most {MOST_TEXELS:,} are supported (16384x8192); scale it down"
+MOST_TEXELS = 178_956_970
+"""Largest number of pixels of a texture's file: Pillow's own limit."""
+_LIMIT = f"at most {MOST_TEXELS:,} are supported; scale it down"
 
 
 class OutsideError(SceneError):
@@ -99,15 +100,16 @@ def read_image(source: Path | bytes | memoryview, what: str) -> np.ndarray:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit here is another one
-            opened = Image.open(source if isinstance(source, Path) else io.BytesIO(source))
+            opened = Image.open(source if isinstance(source, Path) else io.BytesIO(source), formats=_formats())
         with opened as image:
             width, height = image.size
             if 0 in image.size:
                 raise SceneError(f"{what} has no pixels ({width}x{height}); replace it")
             if width * height > MOST_TEXELS:
                 raise SceneError(f"{what} has {width}x{height} pixels, {_LIMIT}")
-            check_memory(f"{what}: {width}x{height} pixels", 9 * width * height)
-            if image.mode.startswith("I"):
+            is_deep = image.mode.startswith("I")
+            check_memory(f"{what}: {width}x{height} pixels", (18 if is_deep else 9) * width * height)
+            if is_deep:
                 grey = (np.asarray(image, np.int64) >> 8).clip(0, 255).astype(np.uint8)
                 return np.stack([grey, grey, grey, np.full_like(grey, 255)], axis=-1)
             return _rgba(image)
@@ -127,6 +129,15 @@ def read_image(source: Path | bytes | memoryview, what: str) -> np.ndarray:
     ) as error:
         reason = one_line(error, type(error).__name__)  # readers of damaged files raise what they stumble over
         raise SceneError(f"{what} cannot be read as an image ({reason}); replace or repair it") from error
+
+
+@cache
+def _formats() -> tuple[str, ...]:
+    """Return the formats that are read: all of Pillow's but those whose reader starts another program."""
+    from PIL import Image
+
+    Image.init()
+    return tuple(name for name in Image.OPEN if name not in ("EPS", "WMF"))
 
 
 def _rgba(image: Image.Image) -> np.ndarray:

@@ -271,6 +271,7 @@ class MtlReader:
                 if os.path.isabs(name):
                     check_inside(Path(name), what)
                 if os.path.isfile(name):
+                    check_inside(Path(name), what)
                     return Path(name)
                 tries = [(folder, bare)]
             for place, candidate in tries:

@@ -18,6 +18,7 @@ import numpy as np
 from warp_gi.color import RGB_FROM_XYZ, bands, decode_srgb, rgb_from_primaries
 from warp_gi.errors import SceneError
 from warp_gi.files import user_path
+from warp_gi.memory import check_memory
 from warp_gi.openimageio import open_image, reason
 
 LARGEST_HEIGHT = 4096  # texel coordinates must be exact in float32 with bits left to interpolate
@@ -134,6 +135,7 @@ def _read_pixels(path: Path, name: str, wanted: str, orientation: int = 0) -> np
                 f"{name}: its data window is {spec.width}x{spec.height}, at most {LARGEST_WINDOW} a side is supported;"
                 " crop it to the display window"
             )
+        check_memory(f"{name}: a data window of {spec.width}x{spec.height} pixels", 12 * spec.width * spec.height)
         first = layer.channels[0]
         if layer.channels == (first, first + 1, first + 2):
             pixels = _read_channels(image, spec, layer.part, first, first + 3)

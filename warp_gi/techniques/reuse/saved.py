@@ -128,7 +128,7 @@ def cache_fault(state: Any, before: Any, octree: Any) -> str:
         "items": Layout("int32", (size,), 0),
         "rates": Layout("float32", (size,), 0, MOST),
         "chances": Layout("float32", (size,), 0, 1.0001),
-        "exploration": Layout("float32", (leaves,), 1e-6, 1),
+        "exploration": Layout("float32", (leaves,), float(np.finfo(np.float32).tiny), 1),
         "alone": Layout("int32", (leaves,), 0, 1),
         "moments": Layout("float32", (leaves, 2), -MOST, MOST),
         "excesses": Layout("float32", (leaves,), -MOST, MOST),
