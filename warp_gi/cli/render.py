@@ -203,7 +203,10 @@ def run(options: Render, report: Reporter) -> None:
         sequence.prepare(plan)
         times: dict[str, list[float]] = {}
         if options.cluster:
-            if plan.todo:
+            if not plan.todo:
+                with report.bar(0):  # its last line, for programs
+                    pass
+            else:
                 from warp_gi.cli.cluster import render_on_cluster, scene_by_path
 
                 source = scene_by_path(options, options.environment_turn, sequence)
