@@ -101,7 +101,8 @@ def test_missing_device_names_the_ones_there():
 def test_loading_is_timed_on_the_wall_and_the_cores(monkeypatch):
     for name in ("compile_seconds", "compile_cpu_seconds"):
         monkeypatch.setattr(launch, name, 0.0)
-    module = SimpleNamespace(name="slow", load=lambda device, block: (time.sleep(0.2), sum(range(10**6))))
+    module = SimpleNamespace(name="slow", get_module_identifier=lambda block: "slow")
+    module.load = lambda device, block: (time.sleep(0.2), sum(range(10**6)))
     launch.load(SimpleNamespace(module=module), CPU)
     assert launch.compile_seconds > launch.compile_cpu_seconds + 0.1 and launch.compile_cpu_seconds > 0
 
@@ -115,7 +116,9 @@ def test_a_module_is_announced_until_it_is_loaded(monkeypatch):
             raise KeyboardInterrupt
 
     monkeypatch.setattr(launch, "on_load", fail_once)
-    kernel = SimpleNamespace(module=SimpleNamespace(name="announced", load=lambda device, block: None))
+    module = SimpleNamespace(name="announced", load=lambda device, block: None)
+    module.get_module_identifier = lambda block: "announced"
+    kernel = SimpleNamespace(module=module)
     with pytest.raises(KeyboardInterrupt):
         launch.load(kernel, CPU)
     for _ in range(2):

@@ -139,7 +139,7 @@ def test_what_is_no_cluster_is_one_line(cluster, words, tmp_path, monkeypatch):
     with pytest.raises((OptionError, OSError)) as error:
         list(render(tmp_path, "path", 1, cluster=cluster))
     assert words in str(error.value) and "\n" not in str(error.value)
-    with pytest.raises(OptionError, match="leave chunk and frame_time out"):
+    with pytest.raises(OptionError, match="leave chunk, frame_time and skip out"):
         list(render(tmp_path, "path", 1, cluster=cluster, chunk=(1, 2)))
     assert not list(tmp_path.iterdir())
 
