@@ -1,10 +1,9 @@
 """Averages over frames of what smooth surfaces reflect: they follow the mirror image, not the surface.
 
 The mirror image of a point at a distance t beyond a surface is seen t behind it, along the same ray from the camera;
-by a surface of curvature k it is at t', with 1/t' = 1/t + 2 k (the mirror equation at normal incidence; Stachowiak
-2015, "Stochastic Screen-Space Reflections", calls the idea "parallax correction"). One ray a pixel in the mirror
-direction finds t, without noise. The average of glossy light is taken from where that image was in the frame before, if
-the surface there reflected the same point. Rough surfaces show no image, and follow the surface.
+by a surface of curvature k it is at t', with 1/t' = 1/t + 2 k (the mirror equation at normal incidence). One ray a
+pixel in the mirror direction finds t, without noise. The average of glossy light is taken from where that image was in
+the frame before, if the surface there reflected the same point. Rough surfaces show no image, and follow the surface.
 """
 
 import warp as wp
@@ -28,7 +27,6 @@ MOST_ALPHA = wp.constant(wp.float32(0.3))  # GGX alpha of surfaces that show an 
 BLURRED_FRAMES = wp.constant(wp.float32(20.0))  # frames kept of an average elsewhere, times alpha
 NEAR = wp.constant(wp.float32(0.15))  # relative difference of the distances of one reflected point
 FAR = wp.constant(wp.float32(1.0e6))  # metres: the sky
-SMALLEST_CURVATURE = wp.constant(wp.float32(1.0e-6))  # 1/m
 
 
 # The cameras of a frame and of the frame before.
@@ -127,10 +125,7 @@ def reproject_reflections(
     now.guide_reflected[i] = t
     if settings.settles == 0:
         return
-    bent = 1.0 / t + 2.0 * curvature(settings, now, i)
-    if bent <= 1.0 / FAR:
-        bent = 1.0 / FAR
-    behind = 1.0 / bent
+    behind = 1.0 / wp.max(1.0 / t + 2.0 * curvature(settings, now, i), 1.0 / FAR)
     image = place + view * (behind * views.now.spread)  # orthographic rays are parallel: no way along them moves it
     was = image + (moved - 2.0 * wp.dot(moved, normal) * normal) * (behind / t)
     was = was + 2.0 * wp.dot(now.guide_previous[i] - place, normal) * normal
