@@ -69,7 +69,7 @@ def _load(module: Any, device: wp.Device, block: int, folder: Path) -> None:
     if folder.is_dir() and not (folder / SUMS).exists():
         with contextlib.suppress(OSError):  # of another user: it is read without
             part = folder / f".{SUMS}.{os.getpid()}"
-            part.write_text(json.dumps(_sums(folder)))
+            part.write_text(json.dumps(sums(folder)))
             os.replace(part, folder / SUMS)
 
 
@@ -93,7 +93,8 @@ def _unwritable(folder: object, error: OSError) -> OSError:
     return OSError(error.errno or errno.EIO, problem, str(folder))
 
 
-def _sums(folder: Path) -> dict[str, str]:
+def sums(folder: Path) -> dict[str, str]:
+    """Return the hashes of a module's machine code, by file."""
     return {
         file.name: hashlib.sha256(file.read_bytes()).hexdigest()
         for file in sorted(folder.iterdir())
@@ -105,7 +106,7 @@ def _changed(folder: Path) -> str:
     """Return which file of a module is not what it was, or ""."""
     try:
         known = json.loads((folder / SUMS).read_text())
-        now = _sums(folder)
+        now = sums(folder)
         changed = [name for name, value in known.items() if now.get(name, value) != value]
         return f"{changed[0]} has changed" if changed else ""
     except FileNotFoundError:

@@ -22,6 +22,8 @@ from typing import Any
 
 import warp as wp
 
+from warp_gi import shipped
+
 try:
     import fcntl
 except ImportError:  # Windows: two processes may compile one module, as Warp has it
@@ -68,9 +70,14 @@ def lock_of(module: str) -> threading.RLock:
 
 
 def prepare(module: Any) -> None:
-    """Set the flags of a module of this package before it is hashed; flags that somebody set stay."""
-    if module.name.startswith(_PACKAGE) and module.options["cpu_compiler_flags"] is None:
-        module.options["cpu_compiler_flags"] = f"{wp.config.cpu_compiler_flags or '-march=native'} {FLAG}"
+    """Set the flags of a module of this package before it is hashed; flags that somebody set stay.
+
+    They are those of compiled kernels that came with the package, if one of them is this module.
+    """
+    if not module.name.startswith(_PACKAGE) or module.options["cpu_compiler_flags"] is not None:
+        return
+    if not shipped.bring(module, FLAG):
+        module.options["cpu_compiler_flags"] = f"{wp.config.cpu_compiler_flags or shipped.NATIVE} {FLAG}"
         module.mark_modified()
 
 
