@@ -26,6 +26,8 @@ UNKNOWN = wp.constant(wp.float32(-1.0))  # Filtered: in place of a variance
 SMALLEST = wp.constant(wp.float32(1.0e-20))  # keeps quotients finite
 MOST_LIGHT = wp.constant(wp.float32(1.0e15))  # more, or what is no number, is no light
 LARGEST_EXPONENT = wp.constant(wp.float32(12.0))  # of a tap's weight: what is farther off counts nothing
+LEAST_AROUND = wp.constant(wp.float32(8.0))  # pixels around, fewer of which tell no outlier
+LEAST_KNOWN = wp.constant(wp.float32(128.0))  # frames of all pixels around, fewer of which know no mean square
 LEAST_WEIGHT = wp.constant(wp.float32(1.0e-2))  # of history: less is a neighbour's light, which a pixel hardly touches
 
 
@@ -111,6 +113,9 @@ class DenoiseSettings:
     filters_diffuse: wp.int32  # in this level
     filters_glossy: wp.int32
     settles: wp.int32  # 1: there is an average over frames; 0: this is the first one
+    outliers: wp.float32  # times the light around above which light is shared out
+    shift_x: wp.int32  # pixels by which this frame's blocks of shared light begin outside of the picture
+    shift_y: wp.int32
 
 
 # a / b where b is above nothing.
@@ -259,6 +264,88 @@ def reproject(first: wp.int32, settings: DenoiseSettings, now: Guides, before: G
         moments[1] = h.moments[1] / h.weight[1]
     out.length[i] = length
     out.moments[i] = moments
+
+
+# Pixels of a block that a pixel's light is compared with and shared among: those of its surface whose light of the lobe
+# is known.
+@wp.func
+def is_around(
+    settings: DenoiseSettings,
+    guides: Guides,
+    length: wp.array(dtype=wp.vec2),
+    lobe: wp.int32,
+    i: wp.int32,
+    x: wp.int32,
+    y: wp.int32,
+) -> wp.bool:
+    if x < 0 or y < 0 or x >= settings.width or y >= settings.height:
+        return False
+    j = y * settings.width + x
+    if j == i or length[j][lobe] <= 0.0:
+        return False
+    return same_surface(settings, guides, i, guides.guide_position[i], guides, j)
+
+
+# Share out what the light of pixel i has above a limit among it and the pixels around in the block from (x0, y0); their
+# sum stays. The limit is a multiple of the root of the mean square of earlier light there.
+@wp.func
+def share_outlier(
+    settings: DenoiseSettings,
+    guides: Guides,
+    noisy: Signals,
+    history: Signals,
+    lobe: wp.int32,
+    i: wp.int32,
+    x0: wp.int32,
+    y0: wp.int32,
+):
+    light = noisy.diffuse
+    if lobe == 1:
+        light = noisy.glossy
+    count = float(0.0)
+    frames = float(0.0)
+    square = float(0.0)
+    for k in range(BLOCK * BLOCK):
+        x = x0 + k % BLOCK
+        y = y0 + k / BLOCK
+        if is_around(settings, guides, noisy.length, lobe, i, x, y):
+            j = y * settings.width + x
+            count += 1.0
+            frames += history.length[j][lobe]
+            square += history.length[j][lobe] * history.moments[j][lobe]
+    if count < LEAST_AROUND or frames < LEAST_KNOWN:
+        return
+    own = luminance(light[i])
+    limit = settings.outliers * wp.sqrt(square / frames)
+    if own <= limit:
+        return
+    part = light[i] * ((1.0 - limit / own) / (count + 1.0))
+    light[i] = light[i] * (limit / own) + part
+    for k in range(BLOCK * BLOCK):
+        x = x0 + k % BLOCK
+        y = y0 + k / BLOCK
+        if is_around(settings, guides, noisy.length, lobe, i, x, y):
+            j = y * settings.width + x
+            light[j] = light[j] + part
+
+
+# Thread: a block of pixels, with its pixels one after the other. Light that a single ray found, and hardly any before
+# or around, is shared out: averages over frames keep it for long as a dot. Squares stay as they were, for the filter:
+# the light is as uncertain as before.
+@wp.kernel
+def share_outliers(first: wp.int32, settings: DenoiseSettings, guides: Guides, noisy: Signals, history: Signals):
+    b = first + wp.tid()
+    columns = (settings.width + settings.shift_x + BLOCK - 1) / BLOCK
+    x0 = (b % columns) * BLOCK - settings.shift_x
+    y0 = (b / columns) * BLOCK - settings.shift_y
+    for y in range(wp.max(y0, 0), wp.min(y0 + BLOCK, settings.height)):
+        for x in range(wp.max(x0, 0), wp.min(x0 + BLOCK, settings.width)):
+            i = y * settings.width + x
+            for lobe in range(2):
+                square = noisy.moments[i][lobe]
+                known = settings.outliers * settings.outliers * history.moments[i][lobe]
+                if square > 0.0 and square > known:
+                    share_outlier(settings, guides, noisy, history, lobe, i, x0, y0)
 
 
 # By how much a block's light has changed, from sums over its pixels of: the new light less the average before, the

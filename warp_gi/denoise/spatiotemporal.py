@@ -28,6 +28,8 @@ LONG = 4.0
 FIRST_NORMAL, FIRST_LUMINANCE, FIRST_EDGES = 0.25, 2.0, 2
 """Factors of `normal_power`, `luminance` and `edge_samples` in a frame that no frame leads to: few samples, which bumps
 of a surface keep apart, leave dots."""
+SHIFTS = 4
+"""What tells the random numbers of blocks from others of a frame."""
 CLIP = 1.5
 """Standard deviations of the pixels around a pixel, to which the last picture is limited in it."""
 
@@ -67,6 +69,10 @@ class SpatioTemporal(Denoiser):
     """Standard deviations by which the light of a block of 8x8 pixels has changed when earlier frames begin to be
     forgotten; at twice as many all are. 0 never forgets."""
 
+    outliers: float = 6.0
+    """Times the root mean square of earlier light around a pixel, in a block of 8x8 and on its surface, above which its
+    new light is shared out there: what one ray of many found would stay as a dot. The sum is kept. 0 never shares."""
+
     first_samples: int = 4
     """Samples a pixel, at least, of a frame without a frame before, 1 to 65536: the first one, a still, or after a cut.
     There is no average yet that would make up for few. Its filter is wider, and edges take twice as many samples."""
@@ -96,6 +102,8 @@ class SpatioTemporal(Denoiser):
         for name in ("luminance", "plane_distance", "normal_power"):
             if not 0 < getattr(self, name) < math.inf:
                 raise OptionError(f"{name} must be above 0, got {getattr(self, name)}")
+        if not 0 <= self.outliers < math.inf:
+            raise OptionError(f"outliers must be 0 or a factor above it, got {self.outliers}")
         if not 0 <= self.lag < math.inf:
             raise OptionError(f"lag must be 0 or a number of deviations above it, got {self.lag}")
 
@@ -171,8 +179,26 @@ class SpatioTemporal(Denoiser):
         changes.glossy = wp.empty_like(changes.diffuse)
         if self.lag > 0:
             frame.launch(denoise.find_changes, [settings, noisy, average, changes], columns * rows)
+        self._share(frame, settings, guides, noisy, average)  # what is shared out would look like a change of a block
         frame.launch(denoise.add_frame, [settings, noisy, average, changes, average])
         return average, changes if self.lag > 0 else None
+
+    def _share(
+        self,
+        frame: Frame,
+        settings: denoise.DenoiseSettings,
+        guides: denoise.Guides,
+        noisy: denoise.Signals,
+        history: denoise.Signals,
+    ) -> None:
+        """Share out light that a single sample found; blocks begin elsewhere in each frame, so that none is seen."""
+        if self.outliers > 0:
+            block = int(denoise.BLOCK)
+            shifts = np.random.default_rng((frame.seed, frame.index, SHIFTS)).integers(0, block, 2)
+            settings.outliers, settings.shift_x, settings.shift_y = self.outliers, int(shifts[0]), int(shifts[1])
+            width, height = frame.camera.resolution
+            count = math.ceil((width + shifts[0]) / block) * math.ceil((height + shifts[1]) / block)
+            frame.launch(denoise.share_outliers, [settings, guides, noisy, history], count)
 
     def _reflect(
         self,

@@ -1,0 +1,123 @@
+"""Light that one sample of many found is shared out among the pixels around; their sum stays."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scene_tools import card
+from test_denoise import CPU, LUMINANCE, NO_BLUR, H, W, filled, image, random_guides, settings_of
+
+import warp_gi as gi
+from warp_gi import launch
+from warp_gi.denoise import SpatioTemporal
+from warp_gi.kernels import denoise
+
+BLOCK = int(denoise.BLOCK)
+
+
+def shared(guides, lights, moments, lengths, before, frames, shift, outliers):
+    """What the kernel makes of both lobes; their squares stay."""
+    noisy = filled(denoise.Signals, diffuse=lights[0], glossy=lights[1], moments=moments, length=lengths)
+    history = filled(denoise.Signals, moments=before, length=frames)
+    settings = settings_of(footprint=0.05, outliers=outliers, shift_x=shift[0], shift_y=shift[1])
+    count = -(-(W + shift[0]) // BLOCK) * -(-(H + shift[1]) // BLOCK)
+    launch.launch(denoise.share_outliers, count, [settings, filled(denoise.Guides, **guides), noisy, history], CPU)
+    np.testing.assert_array_equal(image(noisy.moments, H, W), moments)
+    return [image(noisy.diffuse, H, W), image(noisy.glossy, H, W)]
+
+
+def expected(guides, light, moments, length, before, frames, shift, outliers):
+    """The same of one lobe in float64, and how many pixels were outliers."""
+    light, found = light.astype(np.float64), 0
+    position, normal, plane = (guides[f"guide_{name}"].astype(float) for name in ("position", "normal", "plane"))
+    for top in range(-shift[1], H, BLOCK):
+        for left in range(-shift[0], W, BLOCK):
+            block = [(y, x) for y in range(top, top + BLOCK) for x in range(left, left + BLOCK)]
+            block = [(y, x) for y, x in block if 0 <= y < H and 0 <= x < W]
+            for at in block:
+                around = [
+                    one
+                    for one in block
+                    if one != at
+                    and length[one] > 0
+                    and guides["guide_object"][one] == guides["guide_object"][at]
+                    and normal[at] @ normal[one] >= 0.85
+                    and abs(plane[at] @ (position[one] - position[at])) < 0.15 * guides["guide_distance"][at]
+                ]
+                known = sum(frames[one] for one in around)
+                if len(around) < 8 or known < 128 or moments[at] <= outliers**2 * before[at]:
+                    continue
+                own = light[at] @ LUMINANCE
+                limit = outliers * np.sqrt(sum(frames[one] * before[one] for one in around) / known)
+                if own > limit:
+                    part = light[at] * (1 - limit / own) / (len(around) + 1)
+                    light[at] = light[at] * limit / own + part
+                    for one in around:
+                        light[one] += part
+                    found += 1
+    return light, found
+
+
+def random_light(rng):
+    """Light of two lobes of which one pixel in ten is an outlier, its squares, and of which pixels it is known."""
+    lights = rng.exponential(1.0, (2, H, W, 3)) * rng.choice([1, 40], (2, H, W, 1), p=[0.9, 0.1])
+    lengths = (rng.random((H, W, 2)) < 0.9).astype(np.float32)
+    lights[np.moveaxis(lengths, -1, 0) == 0] = 0
+    lights = lights.astype(np.float32)
+    return lights, np.stack([(light @ LUMINANCE) ** 2 for light in lights], -1).astype(np.float32), lengths
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (3, 5)])
+def test_outliers_are_shared_out_and_their_sum_stays(shift):
+    rng = np.random.default_rng(3)
+    guides, (lights, moments, lengths) = random_guides(rng), random_light(rng)
+    before = rng.exponential(2.0, (H, W, 2)) * rng.choice([1, 400], (H, W, 2), p=[0.95, 0.05])
+    before, frames = before.astype(np.float32), rng.integers(0, 33, (H, W, 2)).astype(np.float32)
+    results = shared(guides, lights, moments, lengths, before, frames, shift, 4.0)
+    for lobe, (light, result) in enumerate(zip(lights, results, strict=True)):
+        given = (one[..., lobe] for one in (moments, lengths, before, frames))
+        right, found = expected(guides, light, *given, shift, 4.0)
+        assert found >= 3
+        np.testing.assert_allclose(result, right, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(result.sum((0, 1)), light.sum((0, 1)), rtol=1e-5)
+
+
+@pytest.mark.parametrize("spared", ["expected", "new"])
+def test_light_that_is_as_rare_as_before_and_surfaces_that_are_new_are_left_alone(spared):
+    rng = np.random.default_rng(4)
+    guides, (lights, moments, lengths) = random_guides(rng), random_light(rng)
+    before = np.full((H, W, 2), moments.max() / 64 if spared == "expected" else 1e-3, np.float32)
+    frames = np.full((H, W, 2), 32.0 if spared == "expected" else 1.0, np.float32)
+    results = shared(guides, lights, moments, lengths, before, frames, (1, 2), 8.0)
+    np.testing.assert_array_equal(results, lights)
+
+
+def test_a_dot_of_one_ray_does_not_stay():
+    """One sample of 4,096 finds a lamp a hundred times as bright as the rest: the largest dot over the mean."""
+    peaks = {}
+    for outliers in (0.0, 6.0):
+        denoiser = SpatioTemporal(outliers=outliers, lag=0.0, **NO_BLUR)
+        only = {"environment": None, "emitters": None, "spp": 1, "camera_samples": 1}
+        scheduler = gi.FrameScheduler(WALL, STILL, gi.Pipeline(indirect=Lamp(), denoise=denoiser, **only))
+        frames = [scheduler.frame(index) for index in range(8)]
+        picture = frames[-1].numpy("beauty")
+        noisy = np.mean([frame.numpy("noisy").mean() for frame in frames])
+        assert picture.mean() == pytest.approx(noisy, rel=1e-3)
+        peaks[outliers] = picture[2:-2, 2:-2].max() / picture.mean()  # blocks in corners may have too few pixels
+    assert peaks[0.0] > 8 and peaks[6.0] < 2.5
+
+
+@dataclass(frozen=True)
+class Lamp(gi.BsdfPaths):
+    """Light of an even wall, and from the fourth frame on in one of 4,096 pixels that of a small lamp."""
+
+    def trace(self, frame, state):
+        """Fill the term."""
+        rng = np.random.default_rng(frame.seed + frame.index)
+        values, is_rare = rng.uniform(0.5, 1.5, (2, len(frame["indirect"])))
+        values += 100.0 * (is_rare < 0.5 + 1 / 4096) * (frame.index > 2)
+        frame["indirect"].assign(np.repeat(values[:, None], 3, axis=1))
+
+
+WALL = gi.Scene([gi.Node("wall", [card(0.0, 9.0, gi.Material("grey", (0.5, 0.5, 0.5), specular=0.0))])])
+STILL = gi.CameraPath.still(gi.Camera.look_at((0, 0, 2), (0, 0, 0), hfov=60, resolution=(64, 48)))
