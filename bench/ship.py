@@ -7,6 +7,7 @@ Run it before the wheel is built (``warp_gi.shipped`` says what becomes of them)
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import multiprocessing
 import shutil
@@ -18,16 +19,32 @@ from pathlib import Path
 
 import warp as wp
 
-from warp_gi import kernel_cache, launch, loading, shipped
+from warp_gi import kernel_cache, launch, loading, registry, shipped
 from warp_gi.bench.compile_cuda import kernel_modules
+from warp_gi.kernels.path_samplers import BSDF_DIRECTIONS, NO_REGIONS, SCENE_SKY, LightSampler, PathCache, Sky
+from warp_gi.kernels.path_trace import path_tracer
 
 KEPT = (".o", ".meta")
 """Files of a compiled module that loading reads."""
 
 
+def shipped_modules() -> list[str]:
+    """Return the names of all modules with kernels, path tracers that presets make of several hooks among them."""
+    names = kernel_modules()
+    found = registry.samplers().values()
+    lights = [one for one in found if isinstance(one, LightSampler) and not one.uses_regions]
+    skies = [SCENE_SKY, *(one for one in found if isinstance(one, Sky))]
+    caches = [one for one in found if isinstance(one, PathCache)]
+    tracers = [
+        path_tracer(light, BSDF_DIRECTIONS, NO_REGIONS, sky, cache)
+        for light, sky, cache in itertools.product(lights, skies, caches)
+    ]
+    return sorted({*names, *(tracer.trace_paths.module.name for tracer in tracers)})
+
+
 def place(name: str, folder: Path) -> Path:
-    """Return where a module, as its source is now, belongs in a folder of compiled kernels; sets the module's flags."""
-    kernel_modules()  # a Warp module is known once its file is imported
+    """Return where a module of the present source belongs in a folder of compiled kernels; sets the module's flags."""
+    shipped_modules()  # a Warp module is known once its file is imported
     module, flags = wp.get_module(name), shipped.flags(loading.FLAG)
     module.options["cpu_compiler_flags"] = flags
     module.mark_modified()
@@ -61,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--folder", type=Path, default=shipped.OBJECTS, help="default: the one that the package reads")
     parser.add_argument("--check", action="store_true", help="only say what is missing; exit code 1 if anything is")
     options = parser.parse_args(arguments)
-    names = options.names or kernel_modules()
+    names = options.names or shipped_modules()
     if not shipped.knows_level():
         parser.error("wheels bring kernels for x86-64-v3 on Linux, which this machine is not")
     if options.check:

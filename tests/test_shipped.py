@@ -10,7 +10,8 @@ from types import SimpleNamespace
 import pytest
 import warp as wp
 
-from warp_gi import loading, shipped
+import warp_gi as gi
+from warp_gi import foretold, loading, shipped
 from warp_gi.bench import ship
 
 NAME = "warp_gi.kernels.one"
@@ -129,3 +130,10 @@ def test_what_is_shipped_is_loaded_without_a_compiler(tmp_path):
     assert FLAGS in told.stdout
     files = {one.suffix for one in (tmp_path / "cache").rglob("wp_*/*")}
     assert files == {".o", ".meta", ".sha256"}  # no .cpp: nothing was compiled
+
+
+def test_every_kernel_that_a_preset_foretells_is_shipped():
+    scene, known = gi.builtin_scene("cornell_box"), set(ship.shipped_modules())
+    for name in gi.Pipeline.presets():
+        modules = {kernel.module.name for kernel in foretold.kernels_of(gi.Pipeline.preset(name), scene)}
+        assert modules <= known, name
