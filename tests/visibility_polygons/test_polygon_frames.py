@@ -14,6 +14,7 @@ from test_polygon_bake import GREY, ball, floor
 import warp_gi as gi
 from warp_gi.cli import main as cli
 from warp_gi.errors import BakeError, SceneError
+from warp_gi.techniques.visibility_polygons import pictures
 from warp_gi.techniques.visibility_polygons.export import read_polygons
 
 SKY = gi.Environment(pixels=city(64))
@@ -169,7 +170,9 @@ def test_bad_settings(settings, told):
         gi.VisibilityPolygons(**settings)
 
 
-def test_the_command_bakes_shows_and_exports(tmp_path, capsys):
+def test_the_command_bakes_shows_and_exports(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(pictures, "REFERENCE_SAMPLES", 4)
+    monkeypatch.setattr(pictures, "SHOW_SAMPLES", 1)
     bake, out = tmp_path / "a.polygons.safetensors", tmp_path / "a.bin"
     command = ["bake", "sphere_row", "--technique", "visibility-polygons", "--resolution", "16", "-o", str(bake)]
     assert cli.main([*command, "--export", str(out), "--show", str(tmp_path / "show"), "--quiet"]) == 0
