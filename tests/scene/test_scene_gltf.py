@@ -345,9 +345,18 @@ def test_broken_files_are_one_clear_line(case, tmp_path):
 def test_missing_buffer_file(tmp_path):
     glb = rich_glb()
     glb.bytes()
-    glb.json["buffers"] = [{"byteLength": len(glb.binary), "uri": "mesh.bin"}]
-    (tmp_path / "a.gltf").write_text(json.dumps(glb.json))
-    with pytest.raises(SceneError, match=r"buffer file '.*mesh\.bin' is missing"):
+    for uri, told in (
+        (
+            "https://example.org/mesh.bin",
+            "buffer file 'https://example.org/mesh.bin' is an address, and only files are",
+        ),
+        ("mesh.bin", r"buffer file '.*mesh\.bin' is missing"),
+    ):
+        glb.json["buffers"] = [{"byteLength": len(glb.binary), "uri": uri}]
+        (tmp_path / "a.gltf").write_text(json.dumps(glb.json))
+        with pytest.raises(SceneError, match=told):
+            gi.load_scene(tmp_path / "a.gltf")
+    with pytest.raises(SceneError, match="is missing"):
         gi.load_scene(tmp_path / "a.gltf")
     (tmp_path / "mesh.bin").write_bytes(glb.binary[:100])
     with pytest.raises(SceneError, match="buffer 0 is truncated: it should have"):

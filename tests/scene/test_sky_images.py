@@ -102,10 +102,14 @@ def test_a_layer_of_a_part(tmp_path):
         Environment.load(f"{file}:key")
 
 
-def test_normals_are_no_sky(tmp_path):
+def test_normals_and_depths_are_no_sky(tmp_path):
     file = write(tmp_path / "n.exr", [(spec_of(("N.X", "N.Y", "N.Z")), picture())])
     with pytest.raises(SceneError, match=r"no layer has red, green and blue \(channels: N.X, N.Y, N.Z\)"):
         Environment.load(file)
+    for only in ("Z", "depth.Z", "objectId"):
+        file = write(tmp_path / "z.exr", [(spec_of((only,)), picture()[..., :1])])
+        with pytest.raises(SceneError, match=rf"no layer has red, green and blue \(channels: {only}\)"):
+            Environment.load(file)
     grey = write(tmp_path / "y.exr", [(spec_of("YA"), picture()[..., :2])])
     assert np.array_equal(Environment.load(grey).pixels, np.repeat(picture()[..., :1], 3, axis=-1))
 

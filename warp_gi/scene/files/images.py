@@ -7,6 +7,7 @@ import contextvars
 import difflib
 import io
 import os
+import re
 import struct
 import warnings
 import zlib
@@ -75,6 +76,8 @@ def find_file(folder: Path, name: str, what: str) -> Path:
 
     It is an OutsideError where ``restricted_to`` forbids the file.
     """
+    if re.match("[a-z][a-z0-9+.-]+://", name, re.IGNORECASE):
+        raise SceneError(f"{what} {name!r} is an address, and only files are read; fetch it, and name the file")
     path = folder / name.replace("\\", "/")
     check_inside(path, f"{what} {name!r}" if name not in what else what)
     if os.path.isfile(path):  # False, not an error, for names that are too long

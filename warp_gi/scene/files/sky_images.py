@@ -27,6 +27,8 @@ LARGEST_WINDOW = 4 * LARGEST_HEIGHT  # pixels a side of a data window, which may
 BEAUTY = ("beauty", "combined", "rgba", "rgb", "default")
 """Names, in lower case, of parts and layers that hold the picture itself, the likeliest first."""
 COLORS = ({"r", "red"}, {"g", "green"}, {"b", "blue"})
+GREYS = ("y", "l", "i", "v", "r", "luminance", "intensity", "grey", "gray")
+"""Names, in lower case, by which the only channel of an EXR file is a grey picture, and no depth or number."""
 XYZ_PRIMARIES = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0)
 
 ORIENTATIONS = {"-Y+": 1, "-Y-": 2, "+Y-": 3, "+Y+": 4, "+X-": 5, "-X-": 6, "-X+": 7, "+X+": 8}
@@ -194,10 +196,11 @@ def _layers(image: Any, name: str) -> list[Layer]:
         raise SceneError(f"{name}: deep EXR, which has no one color a pixel; flatten it first")
     if image.format_name() != "openexr" and first.nchannels >= 3:
         return [Layer(0, "", "", (0, 1, 2))]
-    others = {channel.upper() for channel in first.channelnames} - {"A"}
-    if len(others) == 1 or others == {"Y"}:
-        grey = next(i for i, channel in enumerate(first.channelnames) if channel.upper() in others)
-        return [Layer(0, first.get_string_attribute("name"), "", (grey, grey, grey))]
+    others = [i for i, channel in enumerate(first.channelnames) if channel.upper() != "A"]
+    if len(others) == 1:
+        last = first.channelnames[others[0]].rpartition(".")[2].lower()
+        if last in GREYS or image.format_name() != "openexr":
+            return [Layer(0, first.get_string_attribute("name"), "", (others[0],) * 3)]
     raise SceneError(f"{name}: no layer has red, green and blue (channels: {', '.join(first.channelnames)})")
 
 
