@@ -112,7 +112,7 @@ class FrameScheduler:
         if self.pipeline.denoise is not None:  # first of all: it says if it is not installed
             self._start_part(DENOISER, self.pipeline.denoise)
         self._frames: int | None = None
-        self._bake_seconds, self._baked_version, self._scene_hash = 0.0, -1, ""
+        self._bake_seconds, self._baked_version, self._moved, self._scene_hash = 0.0, -1, 0, ""
         self._trail: Trail | None = None
         self._sky_time = sky_start(self.scene.sky_at)
         self._frame_time: float | None = None
@@ -144,6 +144,9 @@ class FrameScheduler:
         self._sky_time = self._sky_time if sky_time is None else sky_time
         self.scene.update_sky(self._sky_time)  # whoever rendered another time of the scene since
         if self._baked_version == self.scene.version:
+            if self._moved != self.scene.moved:  # every part follows other keyframes, and so do hashes
+                self._keys = {place: self._state_key(part) for place, part in self._parts.items()}
+                self._moved, self._scene_hash = self.scene.moved, self.scene.hash
             return
         started = time.perf_counter()
         self._made.clear()
@@ -153,13 +156,16 @@ class FrameScheduler:
             self._start_part(place, part)
         self._scene_hash = self.scene.hash
         self._bake_seconds = time.perf_counter() - started
-        self._baked_version = self.scene.version
+        self._baked_version, self._moved = self.scene.version, self.scene.moved
 
     def _start_part(self, place: str, part: Stateful) -> None:
         """Start a part, unless all that it depends on is what it was."""
-        key = part.state_key(self.scene) or self._key_of(part)
+        key = self._state_key(part)
         if self._keys.get(place) != key:
             self._states[place], self._keys[place] = self._start(place, part), key
+
+    def _state_key(self, part: Stateful) -> str:
+        return part.state_key(self.scene) or self._key_of(part)
 
     def _start(self, place: str, part: Stateful) -> Any:
         """Return a part's state before the first frame, from a bake made before or now."""

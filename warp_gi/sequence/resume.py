@@ -200,8 +200,12 @@ class SequenceRun:
         """Time in ns, by the clock of the disk, from which on files are kept by a resumed run; 0 is any time."""
 
     def bake(self) -> None:
-        """Bake under the sky of the sequence's first frame, so that a resumed sequence has the same bake."""
+        """Bake under the sky of the sequence's first frame, so that a resumed sequence has the same bake.
+
+        Edits are taken over first: raises SceneError for one that cannot be followed.
+        """
         with self.scheduler.scene.lock:
+            self.scheduler.scene.check_unchanged()
             self.scheduler.bake(self.shots[0].time, len(self.shots))
 
     @cached_property
