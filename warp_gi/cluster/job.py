@@ -69,6 +69,8 @@ class Job:
     """Whether frames depend on those before."""
     since: int
     """Time in ns, by the clock of the disk, from which on a file is one of this job; 0 takes older ones, too."""
+    permit: Path | None = None
+    """File of the claim of whoever asked, which is gone when that run has ended: then workers write nothing more."""
 
     def begin(self) -> SequenceRun:
         """Return what renders the sequence in this process.
@@ -79,7 +81,7 @@ class Job:
         scene = self.scene.open()
         scheduler = FrameScheduler(scene, self.camera, self.pipeline, self.device, self.seed, None, bakes, self.cache)
         run = SequenceRun(scheduler, shots_of(scheduler.camera, self.frames, self.output.pattern), self.output)
-        run.since = self.since
+        run.since, run.permit = self.since, self.permit
         run.bake()
         mine, wanted = scheduler.metadata(run.shots[0].time), dict(self.about)
         for name in sorted({*mine, *wanted}):

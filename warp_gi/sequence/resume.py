@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Literal
 
 from warp_gi.baking import settings_in
 from warp_gi.errors import BakeError, OptionError, unknown_name
-from warp_gi.files import check_target, check_writable, frame_path, remove_stale_parts, user_path
+from warp_gi.files import check_target, check_writable, frame_path, remove_stale_parts, user_path, writing_under
 from warp_gi.scene.camera import Camera, CameraPath, frame_time
 from warp_gi.sequence.exr import Attribute
 from warp_gi.sequence.frames import (
@@ -198,6 +198,8 @@ class SequenceRun:
         self._claim: Claim | None = None
         self.since = 0
         """Time in ns, by the clock of the disk, from which on files are kept by a resumed run; 0 is any time."""
+        self.permit: Path | None = None
+        """File of the claim on what is written (``Claim.path``): without it no file appears. None asks for none."""
 
     def bake(self) -> None:
         """Bake under the sky of the sequence's first frame, so that a resumed sequence has the same bake.
@@ -273,6 +275,7 @@ class SequenceRun:
             has_state = plan.dependence.is_saved and self.output.is_exr and not self.output.part
             self._claim = Claim(self.output.pattern, plan.frames, has_state)
             self._claim.take()
+            self.permit = self._claim.path.absolute() if self._claim.is_taken else None
             remove_stale_parts(self.output.state_path)
         for shot in plan.todo:
             check_target(shot.path)
@@ -310,7 +313,8 @@ class SequenceRun:
         frame.metadata |= self._origin(shot)
         started = time.perf_counter()
         remove_stale_parts(shot.path)
-        self.output.write(frame, shot.path)
+        with writing_under(self.permit):
+            self.output.write(frame, shot.path)
         frame.timings["write"] = time.perf_counter() - started
         return frame
 
@@ -324,7 +328,8 @@ class SequenceRun:
         """
         if self.dependence.is_saved and self.output.is_exr:  # nothing resumes from other files
             started = time.perf_counter()
-            self.scheduler.save_state(self.output.state_path, shot.lineage)
+            with writing_under(self.permit):
+                self.scheduler.save_state(self.output.state_path, shot.lineage)
             frame.timings["save state"] = time.perf_counter() - started
 
     def _attributes(self, shot: Shot) -> dict[str, Attribute]:
