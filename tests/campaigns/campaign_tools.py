@@ -6,13 +6,18 @@ import json
 import os
 import queue
 import random
+import resource
+import signal
 import struct
 import subprocess
 import sys
 import threading
+import time
+import traceback
 from collections import Counter
 from datetime import date
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).parent
 COUNTS = HERE / "counts.json"
@@ -215,6 +220,80 @@ class Worker:
             self.process.kill()
             self.process.wait()
             self.process = None
+
+
+# ---- commands in forks ----
+
+
+class Command:
+    """A command of warp-gi in a fork of this process, where modules and kernels are loaded: it may be killed.
+
+    Args:
+        arguments: Those of the command.
+        most_bytes: No file may become larger (RLIMIT_FSIZE), as on a disk that is full; None is no limit.
+        bakes: Folder in which bakes are kept, however short they took; None is the user's, with ``--no-cache`` none.
+    """
+
+    def __init__(self, arguments: list[str], most_bytes: int | None = None, bakes: Path | None = None) -> None:
+        self._said, said = os.pipe()
+        sys.stdout.flush()
+        self.process = os.fork()
+        if self.process == 0:
+            code = 70
+            try:
+                os.close(self._said)
+                for number in (1, 2):
+                    os.dup2(said, number)
+                sys.stdout, sys.stderr = (open(number, "w", closefd=False) for number in (1, 2))
+                code = self._run(arguments, most_bytes, bakes)
+            except BaseException:
+                traceback.print_exc()
+            finally:
+                sys.stderr.flush()
+                os._exit(code)
+        os.close(said)
+        self.code: int | None = None
+        self.said = ""
+
+    @staticmethod
+    def _run(arguments: list[str], most_bytes: int | None, bakes: Path | None) -> int:
+        from warp_gi import kept
+        from warp_gi.cli import main
+
+        if bakes is not None:
+            os.environ["WARP_GI_BAKES"], kept.LEAST_SECONDS = str(bakes), 0.0
+        if most_bytes is not None:
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+        return main.main(arguments)
+
+    def wait(self, seconds: float = 600.0) -> int | None:
+        """Return the exit code, below 0 for a signal; None if it runs on after some seconds."""
+        until = time.monotonic() + seconds
+        while self.code is None:
+            process, status = os.waitpid(self.process, os.WNOHANG)
+            if process:
+                self.code = os.waitstatus_to_exitcode(status)
+                with open(self._said, encoding="utf-8", errors="replace") as pipe:
+                    self.said = pipe.read()
+            elif time.monotonic() > until:
+                return None
+            else:
+                time.sleep(0.002)
+        return self.code
+
+    def kill(self) -> None:
+        """Kill it (SIGKILL), and wait for that."""
+        os.kill(self.process, signal.SIGKILL)
+        self.wait()
+
+
+def run(arguments: list[str], **more: Any) -> Command:
+    """Run a command to its end."""
+    command = Command(arguments, **more)
+    if command.wait() is None:
+        command.kill()
+    return command
 
 
 # ---- counts ----

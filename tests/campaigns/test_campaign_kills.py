@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import random
+import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -12,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from campaign_tools import record, size_of
+from campaign_tools import Command, record, run, size_of
 
 import warp_gi as gi
 from warp_gi.pipeline import Pipeline
@@ -20,97 +22,127 @@ from warp_gi.pipeline import Pipeline
 pytestmark = pytest.mark.slow
 FRAMES, SIZE = 4, "24x16"
 PRESETS = ("path", "direct", "dvf", "probes", "reuse", "hybrid", "transfer", "cache", "polygons", "clean")
+CLI = [sys.executable, "-m", "warp_gi.cli"]
 SCENES = {"still": "cornell_box", "moving": "warehouse"}
 FASTER = {
     "dvf": ["--environment.cell-size", "1", "--environment.samples", "64"],
     "probes": ["--indirect.counts", "2", "2", "2", "--indirect.resolution", "16", "--indirect.rays", "2"],
-    "transfer": ["--environment.resolution", "64", "--environment.rays", "8"],
+    "transfer": ["--environment.storage", "vertices", "--environment.rays", "16", "--environment.first-rays", "8"],
+    "clean": ["--indirect.ends-in.paths", "2000"],
+    "cache": ["--indirect.ends-in.paths", "2000"],
+    "hybrid": ["--environment.cell-size", "1", "--environment.samples", "64"],
+}
+BAKES = {
+    "visibility-field": ["--cell-size", "0.3"],
+    "light-field-probes": ["--counts", "2", "2", "2", "--resolution", "16", "--rays", "16"],
+    "radiance-transfer": ["--resolution", "64", "--rays", "16", "--first-rays", "8"],
+    "surface-cache": ["--paths", "20000"],
+    "visibility-polygons": ["--resolution", "16"],
 }
 
 
 def render(folder: Path, preset: str, scene: str, *more: str) -> list[str]:
-    out = ["-o", str(folder / "a.####.exr"), "--precision", "float", "--quiet", "--no-cache"]
-    command = [sys.executable, "-m", "warp_gi.cli", "render", SCENES[scene], "--environment", "1", "--resolution", SIZE]
-    return [*command, "--spp", "1", "--frames", f"0-{FRAMES - 1}", "--pipeline", preset, *out, *more]
+    """Return the arguments of a render of four small frames under a white sky."""
+    out = ["-o", str(folder / "a.####.exr"), "--precision", "float", "--quiet", "--threads", "2"]
+    sky = ["--environment", "1", "--resolution", SIZE]
+    command = ["render", SCENES[scene], *sky, "--spp", "1", "--frames", f"0-{FRAMES - 1}", "--pipeline", preset]
+    return [*command, *FASTER.get(preset, []), *out, *more]
 
 
 def pictures(folder: Path) -> list[dict[str, np.ndarray]]:
     return [gi.read_frame(folder / f"a.{index:04d}.exr").buffers for index in range(FRAMES)]
 
 
-def test_killed_renders_go_on_to_the_same_bits(tmp_path):
-    assert set(PRESETS) | {"probe_view"} == set(Pipeline.presets())
-    kills, chance = size_of("kills", 20), random.Random(size_of("seed", 1))
-    wholes: dict[tuple[str, str], tuple[list[dict[str, np.ndarray]], float]] = {}
-    counts: Counter[str] = Counter()
-    bad: list[str] = []
-    cases = [(preset, scene) for scene in SCENES for preset in PRESETS]
-    chance.shuffle(cases)
-    for number in range(kills):
-        preset, scene = cases[number % len(cases)]
-        if (preset, scene) not in wholes:
-            folder = tmp_path / f"{preset} {scene}"
-            subprocess.run(render(folder, preset, scene), check=True, timeout=600, capture_output=True)
-            started = time.perf_counter()  # again, with compiled kernels
-            subprocess.run(render(tmp_path / "timed", preset, scene), check=True, timeout=600, capture_output=True)
-            wholes[preset, scene] = pictures(folder), time.perf_counter() - started
-        whole, seconds = wholes[preset, scene]
-        folder = tmp_path / str(number)
-        for _ in range(chance.choice([1, 1, 2])):
-            process = subprocess.Popen(render(folder, preset, scene, "--resume"), stderr=subprocess.DEVNULL)
-            try:
-                process.wait(timeout=seconds * chance.uniform(0.3, 1.0))
-                counts["ended before the kill"] += 1
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-                counts["killed"] += 1
-        done = subprocess.run(render(folder, preset, scene, "--resume"), capture_output=True, text=True, timeout=600)
-        same = done.returncode == 0 and all(
-            one.keys() == other.keys() and all(np.array_equal(one[name], other[name], equal_nan=True) for name in one)
-            for one, other in zip(pictures(folder), whole, strict=True)
-        )
-        left = [path.name for path in folder.iterdir() if path.name.startswith(".") or path.suffix == ".part"]
-        counts["resumed to the same bits" if same else "different"] += 1
-        if not same or left:
-            bad.append(f"{preset} {scene} {number}: {done.returncode} {done.stderr[-200:]} left: {left}")
-    record(
-        "kills of renders, then --resume", kills, counts, f"{len(wholes)} pipelines and scenes, {FRAMES} frames each"
+def are_same(one: list[dict[str, np.ndarray]], other: list[dict[str, np.ndarray]]) -> bool:
+    return all(
+        a.keys() == b.keys() and all(np.array_equal(a[name], b[name], equal_nan=True) for name in a)
+        for a, b in zip(one, other, strict=True)
     )
+
+
+class Case:
+    """A preset and a scene: pictures of an unbroken run, and the seconds that one takes."""
+
+    def __init__(self, folder: Path, preset: str, scene: str) -> None:
+        from warp_gi.cli import main
+
+        assert main.main(render(folder / "whole", preset, scene, "--no-cache")) == 0  # here: forks have its kernels
+        self.whole = pictures(folder / "whole")
+        started = time.perf_counter()
+        timed = run(render(folder / "timed", preset, scene, "--no-cache"))
+        self.seconds = time.perf_counter() - started
+        assert timed.code == 0 and are_same(pictures(folder / "timed"), self.whole), (preset, scene, timed.said)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_killed_renders_go_on_to_the_same_bits(tmp_path, scene):
+    """Each sequence is killed once to three times, anywhere from its start to its end, and then goes on to its end."""
+    assert set(PRESETS) | {"probe_view"} == set(Pipeline.presets())
+    wanted, chance = size_of("kills", 20) // len(SCENES), random.Random(f"{size_of('seed', 1)} {scene}")
+    presets = chance.sample(PRESETS, len(PRESETS))
+    cases: dict[str, Case] = {}
+    counts: Counter[str] = Counter({"killed": 0, "frames": 0, "frames that differ": 0, "other faults": 0})
+    bad: list[str] = []
+    number = 0
+    while counts["killed"] < wanted:
+        preset = presets[number % len(presets)]
+        number += 1
+        if preset not in cases:
+            cases[preset] = Case(tmp_path / preset, preset, scene)
+        case, folder, kept = cases[preset], tmp_path / str(number), tmp_path / f"bakes {number}"
+        cache = ("--cache", kept) if chance.random() < 0.5 else ("--no-cache", None)
+        for _ in range(chance.choice([1, 1, 2, 3])):
+            command = Command(render(folder, preset, scene, "--resume", cache[0]), bakes=cache[1])
+            if command.wait(case.seconds * chance.uniform(0.05, 1.1)) is None:
+                command.kill()
+            counts["killed" if command.code == -signal.SIGKILL else "ended before the kill"] += 1
+        done = run(render(folder, preset, scene, "--resume", cache[0]), bakes=cache[1])
+        left = sorted(path.name for path in folder.iterdir() if path.name.startswith(".") or path.suffix == ".part")
+        parts = sorted(path.name for path in kept.rglob("*.part"))
+        if done.code != 0 or left or parts or done.said:
+            counts["other faults"] += 1
+            bad.append(f"{preset} {number}: exit code {done.code} {done.said[-300:]} left: {left} {parts}")
+        if done.code == 0:
+            same = [are_same([a], [b]) for a, b in zip(pictures(folder), case.whole, strict=True)]
+            counts["frames"] += FRAMES
+            counts["frames that differ"] += same.count(False)
+            if not all(same):
+                bad.append(f"{preset} {number}: of its frames are the same: {same}")
+        shutil.rmtree(folder)
+        shutil.rmtree(kept, ignore_errors=True)
+    note = f"{number} sequences of {FRAMES} frames, {len(cases)} presets"
+    record(f"kills of renders, {scene} scene, then --resume", counts["killed"], counts, note)
     assert not bad, "\n".join(bad)
 
 
 def test_killed_bakes_leave_no_half_file(tmp_path):
-    kills, chance = size_of("bake_kills", 6), random.Random(size_of("seed", 1))
-    target = tmp_path / "a.safetensors"
-    command = [
-        sys.executable,
-        "-m",
-        "warp_gi.cli",
-        "bake",
-        "cornell_box",
-        "--cell-size",
-        "0.2",
-        "--no-cache",
-        "--quiet",
-    ]
-    started = time.perf_counter()
-    subprocess.run([*command, "-o", str(tmp_path / "whole.safetensors")], check=True, timeout=600)
-    seconds, counts = time.perf_counter() - started, Counter()
-    for _ in range(kills):
-        process = subprocess.Popen([*command, "-o", str(target)])
-        try:
-            process.wait(timeout=seconds * chance.uniform(0.5, 1.1))
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        counts["whole" if target.exists() else "nothing"] += 1
-        if target.exists():
-            assert gi.load_bake(target).digest == gi.load_bake(tmp_path / "whole.safetensors").digest
-            target.unlink()
-    subprocess.run([*command, "-o", str(target)], check=True, timeout=600)
-    assert sorted(os.listdir(tmp_path)) == ["a.safetensors", "whole.safetensors"]
-    record("kills of bakes", kills, counts)
+    from warp_gi.cli import main
+
+    wanted, chance, counts = size_of("bake_kills", 10), random.Random(size_of("seed", 1)), Counter({"half files": 0})
+    for place, (technique, settings) in enumerate(BAKES.items()):
+        folder = tmp_path / technique
+        target, whole = folder / "a.safetensors", tmp_path / f"{technique}.safetensors"
+        command = ["bake", "cornell_box", "--environment", "1", "--technique", technique, *settings, "--quiet"]
+        assert main.main([*command, "--no-cache", "-o", str(whole)]) == 0
+        started = time.perf_counter()
+        assert run([*command, "--no-cache", "-o", str(whole)]).code == 0
+        seconds, digest = time.perf_counter() - started, gi.load_bake(whole).digest
+        for number in range(wanted * (place + 1) // len(BAKES) - wanted * place // len(BAKES)):
+            kept = tmp_path / f"{technique} bakes"
+            cache = ("--cache", kept) if number % 2 else ("--no-cache", None)
+            process = Command([*command, cache[0], "-o", str(target)], bakes=cache[1])
+            if process.wait(seconds * chance.uniform(0.3, 1.2)) is None:
+                process.kill()
+            counts["killed" if process.code == -signal.SIGKILL else "ended before the kill"] += 1
+            counts["file whole" if target.exists() else "no file"] += 1
+            if target.exists():
+                assert gi.load_bake(target).digest == digest
+                target.unlink()
+            shutil.rmtree(kept, ignore_errors=True) if chance.random() < 0.3 else None
+        done = run([*command, "--cache", "-o", str(target)], bakes=tmp_path / f"{technique} bakes")
+        assert done.code == 0 and gi.load_bake(target).digest == digest, done.said
+        assert os.listdir(folder) == [target.name]
+    record("kills of bakes", wanted, counts, f"{len(BAKES)} techniques")
 
 
 def test_two_processes_on_one_folder(tmp_path):
@@ -120,7 +152,7 @@ def test_two_processes_on_one_folder(tmp_path):
     for number in range(rounds):
         folder = tmp_path / str(number)
         pair = [
-            subprocess.Popen(render(folder, "clean", "still", "--resume"), stderr=subprocess.PIPE, text=True)
+            subprocess.Popen([*CLI, *render(folder, "clean", "still", "--resume")], stderr=subprocess.PIPE, text=True)
             for _ in range(2)
         ]
         told = [process.communicate(timeout=600)[1] for process in pair]

@@ -197,10 +197,7 @@ def write_frame(frame: FrameLike, pattern: str | Path, precision: str = "half") 
         return write_preview(frame, path)
     if path.suffix.lower() != ".exr":
         raise OptionError(f"cannot write {path.name}: frames are .exr or .png files")
-    previous = getattr(frame, "previous_camera", None)
-    attributes = frame_attributes(frame.index, frame.time, frame.camera, frame.metadata, previous, precision)
-    attributes |= {TIMES + stage: float(seconds) for stage, seconds in frame.timings.items()}
-    attributes |= {MEASURED + name: float(value) for name, value in getattr(frame, "measured", {}).items()}
+    attributes = written_attributes(frame, precision)
     buffers = {name: frame.numpy(name) for name in frame.names}
     with replacing(path) as part:
         try:
@@ -208,6 +205,14 @@ def write_frame(frame: FrameLike, pattern: str | Path, precision: str = "half") 
         except OSError as error:
             raise OSError(str(error).replace(str(part), str(path))) from error
     return path
+
+
+def written_attributes(frame: FrameLike, precision: str) -> dict[str, Attribute]:
+    """Return all EXR attributes of a frame, its stage times and what it measured among them."""
+    previous = getattr(frame, "previous_camera", None)
+    attributes = frame_attributes(frame.index, frame.time, frame.camera, frame.metadata, previous, precision)
+    attributes |= {TIMES + stage: float(seconds) for stage, seconds in frame.timings.items()}
+    return attributes | {MEASURED + name: float(value) for name, value in getattr(frame, "measured", {}).items()}
 
 
 class HasBuffers(Protocol):
@@ -226,8 +231,13 @@ def write_preview(frame: HasBuffers, path: str | Path, exposure: float = 0.0) ->
 
 def read_frame(path: str | Path) -> FrameFile:
     """Read a frame's buffers and metadata back; raises SceneError when the file is missing or not whole."""
+    return _frame_in(path, True)
+
+
+def _frame_in(path: str | Path, keep: bool) -> FrameFile:
+    """Return a frame's file; without ``keep`` it is read to its end, and buffers are zeros."""
     try:
-        return _frame_file(*read_exr(user_path(path)))
+        return _frame_file(*read_exr(user_path(path), keep))
     except GiError:
         raise
     except (ValueError, TypeError, KeyError, IndexError, OverflowError, np.linalg.LinAlgError) as error:
@@ -272,7 +282,7 @@ def why_not_whole(
     gives the resolution.
     """
     try:
-        frame = read_frame(path)
+        frame = _frame_in(path, False)
     except GiError:
         return "missing" if not Path(path).is_file() else "not whole"
     size = next(iter(frame.buffers.values())).shape[1::-1]

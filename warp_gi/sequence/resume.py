@@ -25,6 +25,7 @@ from warp_gi.baking import settings_in
 from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.files import check_target, check_writable, frame_path, remove_stale_parts, user_path, writing_under
 from warp_gi.scene.camera import Camera, CameraPath, frame_time
+from warp_gi.sequence.banded import BandedFrame, render_in_bands
 from warp_gi.sequence.exr import Attribute
 from warp_gi.sequence.frames import (
     frame_attributes,
@@ -307,12 +308,18 @@ class SequenceRun:
             return "of an earlier run"
         return found
 
-    def render(self, shot: Shot) -> Frame:
-        """Render a frame of the plan's ``todo`` and write its file; the time it took is the frame's timing "write"."""
+    def render(self, shot: Shot) -> Frame | BandedFrame:
+        """Render a frame of the plan's ``todo`` and write its file; the time it took is the frame's timing "write".
+
+        A picture that is larger than it may is rendered in bands, and what is returned reads its file.
+        """
+        remove_stale_parts(shot.path)
+        if self.scheduler.rows < shot.camera.resolution[1]:
+            with writing_under(self.permit):
+                return render_in_bands(self.scheduler, shot, self.output, self._origin(shot))
         frame = self._rendered(shot)
         frame.metadata |= self._origin(shot)
         started = time.perf_counter()
-        remove_stale_parts(shot.path)
         with writing_under(self.permit):
             self.output.write(frame, shot.path)
         frame.timings["write"] = time.perf_counter() - started
@@ -321,7 +328,7 @@ class SequenceRun:
     def _rendered(self, shot: Shot) -> Frame:
         return self.scheduler.frame(shot.index, shot.previous)
 
-    def save_state(self, shot: Shot, frame: Frame) -> None:
+    def save_state(self, shot: Shot, frame: Frame | BandedFrame) -> None:
         """Save the state after a frame, if later frames depend on it and a file can hold it all.
 
         Seconds are added to the frame's timings as "save state".

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -50,6 +50,8 @@ class SurfaceCache(RadianceCache):
     A cell knows all light that arrives at the surfaces in it, so a path that ends there needs no shadow ray. Where
     nothing is known a path goes on. Biased: light is averaged over a cell. It is for scenes in which nothing moves.
     """
+
+    is_per_pixel: ClassVar[bool] = True
 
     paths: int = 150_000
     """Number of paths that fill the cells, from pixels of all frames of the camera's path, at least 1000. More paths
