@@ -9,7 +9,7 @@ kernels run over the items of these rows alone. That is for pipelines whose pixe
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,13 +20,11 @@ from warp_gi.errors import OptionError
 from warp_gi.frame import Frame
 from warp_gi.kernels.gbuffer import TILE
 from warp_gi.memory import PLAIN_BYTES, gigabytes, left_on, picture_bytes, too_large
-from warp_gi.scene.camera import frame_time
 
 if TYPE_CHECKING:
     from warp_gi.pipeline import Pipeline
     from warp_gi.scene.baked import BakedScene
     from warp_gi.scene.scene import Scene
-    from warp_gi.scheduler import FrameScheduler
 
 SHARE = 0.5
 """Share of the free memory that a band takes, where nobody says how much it may."""
@@ -114,20 +112,10 @@ def why_whole(pipeline: Pipeline, scene: Scene | BakedScene) -> str:
     return f"{past[0]} depends on the frames before" if past else ""
 
 
-def check_whole(scheduler: FrameScheduler) -> None:
-    """Raise OptionError for a picture that is too large for a frame."""
-    if scheduler.rows < scheduler.camera.resolution[1]:
+def check_whole(rows: int, resolution: tuple[int, int]) -> None:
+    """Raise OptionError for a picture of which only so many rows may be rendered at once."""
+    if rows < resolution[1]:
         raise OptionError(
-            f"{too_large(scheduler.camera.resolution, False)}, more than it may; give an output: files are written in "
-            f"bands of {scheduler.rows} rows"
+            f"{too_large(resolution, False)}, more than it may; give an output: files are written in bands of {rows}"
+            " rows"
         )
-
-
-def bands_of(scheduler: FrameScheduler, index: int, previous_index: int) -> Iterator[BandFrame]:
-    """Yield a frame in bands from the top, each rendered when it is asked for; see ``FrameScheduler.frame``."""
-    height = scheduler.camera.resolution[1]
-    with scheduler.scene.lock:
-        scheduler.scene.check_unchanged()
-        scheduler.bake(frame_time(scheduler.camera, index))
-        for first in range(0, height, scheduler.rows):
-            yield scheduler.band(index, previous_index, range(first, min(first + scheduler.rows, height)))

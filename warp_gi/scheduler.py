@@ -220,7 +220,7 @@ class FrameScheduler:
 
         A frame that an exception interrupts leaves nothing behind: what is rendered next is as if it had not begun.
         """
-        bands.check_whole(self)
+        bands.check_whole(self.rows, self.camera.resolution)
         index, began, timings = int(index), time.perf_counter(), {"bake": 0.0, "compile": 0.0}
         with timed(timings, "scene", self.device):
             self.scene.check_unchanged()
@@ -248,7 +248,7 @@ class FrameScheduler:
         return frame
 
     def band(self, index: int, previous_index: int, rows: range) -> bands.BandFrame:
-        """Return some rows of a frame, as ``bands.bands_of`` asks for them."""
+        """Return some rows of a frame, as ``sequence.banded`` asks for them."""
         timings: dict[str, float] = {}
         with timed(timings, "scene", self.device):
             frame = self._new_frame(index, previous_index, partial(bands.BandFrame, rows=rows))

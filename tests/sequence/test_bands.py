@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 import warp_gi as gi
-from warp_gi.bands import bands_of, why_whole
+from warp_gi.bands import why_whole
 from warp_gi.cli import main as cli
 from warp_gi.errors import OptionError
 from warp_gi.memory import PLAIN_BYTES
 from warp_gi.sequence import banded
+from warp_gi.sequence.banded import bands_of
 from warp_gi.sequence.exr import read_exr
 
 SIZE = (45, 37)  # no whole number of tiles

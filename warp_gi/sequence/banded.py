@@ -7,18 +7,17 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from warp_gi.bands import bands_of
 from warp_gi.errors import one_line
 from warp_gi.files import replacing
 from warp_gi.openimageio import native_name
-from warp_gi.scene.camera import Camera
+from warp_gi.scene.camera import Camera, frame_time
 from warp_gi.sequence.exr import Attribute, channel_names, plain, stored_format, stored_values
 from warp_gi.sequence.frames import read_frame, written_attributes
 from warp_gi.sequence.preview import picture_bytes, tone_map, write_png
@@ -26,7 +25,6 @@ from warp_gi.sequence.preview import picture_bytes, tone_map, write_png
 if TYPE_CHECKING:
     from warp_gi.bands import BandFrame
     from warp_gi.scheduler import FrameScheduler
-    from warp_gi.sequence.resume import Output, Shot
 
 BLOCK = 1 << 24
 """Values that are read from the disk and written at once."""
@@ -34,6 +32,30 @@ LINES = 16
 """Rows that ZIP compression takes together."""
 _TYPES = {(4, 4): "matrix", (3, 3): "matrix33", (2,): "float2"}
 _OIIO_NAMES = {"pixelAspectRatio": "PixelAspectRatio"}
+
+
+class Storage(Protocol):
+    """How files are stored, as ``sequence.resume.Output`` says."""
+
+    @property
+    def is_exr(self) -> bool:
+        """Whether files are EXR files, else PNG."""
+        ...
+
+    @property
+    def precision(self) -> str:
+        """Storage of colours and normals in EXR files."""
+        ...
+
+    @property
+    def preview(self) -> bool:
+        """Whether a tone-mapped PNG is written beside each EXR file."""
+        ...
+
+    @property
+    def exposure(self) -> float:
+        """Exposure of PNG files in stops."""
+        ...
 
 
 @dataclass
@@ -86,7 +108,7 @@ class Rows:
         output: How files are stored, and whether there is a preview.
     """
 
-    def __init__(self, folder: Path | None, output: Output) -> None:
+    def __init__(self, folder: Path | None, output: Storage) -> None:
         self.folder, self.output = folder, output
         self.formats: dict[str, str] = {}
         self.shapes: dict[str, tuple[int, ...]] = {}
@@ -148,19 +170,34 @@ class Rows:
             raise OSError(f"cannot write {path}: {problem or 'unknown failure'}")
 
 
+def bands_of(scheduler: FrameScheduler, index: int, previous_index: int) -> Iterator[BandFrame]:
+    """Yield a frame in bands from the top, each rendered when it is asked for; see ``FrameScheduler.frame``."""
+    height = scheduler.camera.resolution[1]
+    with scheduler.scene.lock:
+        scheduler.scene.check_unchanged()
+        scheduler.bake(frame_time(scheduler.camera, index))
+        for first in range(0, height, scheduler.rows):
+            yield scheduler.band(index, previous_index, range(first, min(first + scheduler.rows, height)))
+
+
 def render_in_bands(
-    scheduler: FrameScheduler, shot: Shot, output: Output, origin: Mapping[str, str | int | float]
+    scheduler: FrameScheduler,
+    index: int,
+    previous_index: int,
+    path: Path,
+    output: Storage,
+    origin: Mapping[str, str | int | float],
 ) -> BandedFrame:
-    """Render a frame in bands, write its preview and its file, and return it.
+    """Render a frame in bands, write its preview and its file ``path``, and return it.
 
     ``origin`` goes to the metadata. Raises OSError for files that cannot be written: then there are none.
     """
     frame: BandedFrame | None = None
     with contextlib.ExitStack() as stack:
-        part = stack.enter_context(replacing(shot.path, own_folder=True)) if output.is_exr else None
+        part = stack.enter_context(replacing(path, own_folder=True)) if output.is_exr else None
         rows = Rows(part and part.parent, output)
-        for band in bands_of(scheduler, shot.index, shot.previous):
-            frame = frame or frame_of(band, shot.path)
+        for band in bands_of(scheduler, index, previous_index):
+            frame = frame or frame_of(band, path)
             for stage, seconds in band.timings.items():
                 frame.timings[stage] = frame.timings.get(stage, 0.0) + seconds
             started = time.perf_counter()
@@ -171,8 +208,8 @@ def render_in_bands(
         frame.timings["bake"] = scheduler.bake_seconds
         frame.metadata |= origin
         if rows.picture:
-            write_png(shot.path.with_suffix(".png"), np.concatenate(rows.picture), output.exposure)
+            write_png(path.with_suffix(".png"), np.concatenate(rows.picture), output.exposure)
         if part is not None:
-            rows.write(part, written_attributes(frame, output.precision), shot.camera.resolution)
+            rows.write(part, written_attributes(frame, output.precision), frame.camera.resolution)
         frame.timings["write"] += time.perf_counter() - started
     return frame

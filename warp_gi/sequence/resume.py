@@ -316,7 +316,8 @@ class SequenceRun:
         remove_stale_parts(shot.path)
         if self.scheduler.rows < shot.camera.resolution[1]:
             with writing_under(self.permit):
-                return render_in_bands(self.scheduler, shot, self.output, self._origin(shot))
+                where = shot.index, shot.previous, shot.path
+                return render_in_bands(self.scheduler, *where, self.output, self._origin(shot))
         frame = self._rendered(shot)
         frame.metadata |= self._origin(shot)
         started = time.perf_counter()

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -51,7 +51,7 @@ class SurfaceCache(RadianceCache):
     nothing is known a path goes on. Biased: light is averaged over a cell. It is for scenes in which nothing moves.
     """
 
-    is_per_pixel: ClassVar[bool] = True
+    is_per_pixel = True
 
     paths: int = 150_000
     """Number of paths that fill the cells, from pixels of all frames of the camera's path, at least 1000. More paths
