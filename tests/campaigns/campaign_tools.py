@@ -300,11 +300,16 @@ def run(arguments: list[str], **more: Any) -> Command:
 
 
 def record(campaign: str, size: int, counts: Counter[str], note: str = "") -> None:
-    """Keep the counts of a campaign, and write the page of them, if WARP_GI_CAMPAIGN_PAGE is set."""
+    """Keep the counts of a campaign, and write the page of them, if WARP_GI_CAMPAIGN_PAGE is set.
+
+    WARP_GI_CAMPAIGN_ADD adds them to what is there, for campaigns that are run in parts with several seeds.
+    """
     print(f"{campaign}: {size} {dict(counts)} {note}")
     if not os.environ.get("WARP_GI_CAMPAIGN_PAGE"):
         return
     known = json.loads(COUNTS.read_text()) if COUNTS.is_file() else {}
+    if os.environ.get("WARP_GI_CAMPAIGN_ADD") and campaign in known:
+        size, counts = size + known[campaign]["size"], counts + Counter(known[campaign]["counts"])
     known[campaign] = {"size": size, "counts": dict(sorted(counts.items())), "note": note, "date": str(date.today())}
     COUNTS.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n")
     rows = [

@@ -18,7 +18,7 @@ import numpy as np
 
 from warp_gi.errors import GiError, OptionError, SceneError, one_line
 from warp_gi.files import frame_path, replacing, user_path
-from warp_gi.scene.camera import Camera
+from warp_gi.scene.camera import LAST_FRAME, Camera
 from warp_gi.scene.pinhole import offset_text
 from warp_gi.sequence.exr import Attribute, plain, read_exr, stored_values, write_exr
 from warp_gi.sequence.preview import picture_bytes, tone_map, write_png
@@ -117,11 +117,13 @@ def parse_frames(text: str) -> list[int]:
     """Return the frame numbers of "5", "0-47", "0-47:2" or a comma-separated list of these, in order, each once."""
     frames: dict[int, None] = {}
     for part in text.split(","):
-        match = re.fullmatch(r"\s*(\d+)(?:-(\d+)(?::(\d+))?)?\s*", part)
+        match = re.fullmatch(r"\s*(\d{1,18})(?:-(\d{1,18})(?::(\d{1,18}))?)?\s*", part)
         first, last, step = match.groups() if match else ("1", "0", None)
         span = range(int(first), int(last or first) + 1, max(int(step or 1), 1))
         if not span or (step is not None and int(step) == 0):
-            raise OptionError(f"frames {text!r} not understood; write for example 5, 0-47, 0-47:2 or 1,4,9-12")
+            raise OptionError(f"frames {text[:80]!r} not understood; write for example 5, 0-47, 0-47:2 or 1,4,9-12")
+        if span[-1] > LAST_FRAME:
+            raise OptionError(f"frames {text[:80]!r}: numbers must be at most {LAST_FRAME:,}")
         if len(span) + len(frames) > MOST_FRAMES:
             raise OptionError(f"frames {text!r} are more than {MOST_FRAMES:,}; render them in parts")
         frames.update(dict.fromkeys(span))
