@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import queue
@@ -18,6 +19,8 @@ from collections import Counter
 from datetime import date
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 HERE = Path(__file__).parent
 COUNTS = HERE / "counts.json"
@@ -155,6 +158,24 @@ def glb_changed(data: bytes, chance: random.Random) -> bytes:
         + text
         + rest
     )
+
+
+def forge(path: Path, target: Path, chance: random.Random) -> None:
+    """Write a bake or state with arrays or settings changed, and the seal of who knows how."""
+    sys.path.insert(0, str(HERE.parent))
+    from test_forged_states import forged, mutations
+
+    import warp_gi as gi
+
+    bake = gi.load_bake(path)
+    rng = np.random.default_rng(chance.getrandbits(32))
+    for name, _, arrays in itertools.islice(mutations(bake.arrays, rng), chance.choice([1, 1, 2])):
+        bake = forged(bake, bake.arrays | {name: arrays[name]})
+    for values in (bake.settings, bake.counts):
+        if values and chance.random() < 0.2:
+            values[chance.choice(sorted(values))] = chance.choice([0, -1, 1e30, 10**9, 0.5, 2**40])
+    with np.errstate(all="ignore"):
+        bake.save(target)
 
 
 # ---- a worker ----
