@@ -26,7 +26,6 @@ from warp_gi.errors import GiError
 from warp_gi.scene.files import images
 
 STILL = gi.Camera.look_at((0, 1, 3.2), (0, 1, 0), resolution=(8, 6))
-POLYGONS = gi.Pipeline.preset("polygons", spp=1)
 _kept: dict[str, object] = {}
 
 
@@ -72,7 +71,7 @@ def as_camera(path: Path) -> np.ndarray:
 
 def as_bake(path: Path) -> np.ndarray:
     bake = gi.load_bake(path)
-    pipeline = PIPELINES.get(bake.technique, POLYGONS)
+    pipeline = PIPELINES.get(bake.technique, PIPELINES["VisibilityField"])
     return next(gi.render(box(), STILL, pipeline, bakes=[bake])).numpy("beauty")
 
 
@@ -88,12 +87,12 @@ READERS |= {f"state-{name}": partial(as_state, name=name) for name in STATES}
 
 def seeds(folder: Path) -> None:
     """Write a bake of each technique and states of several pipelines."""
-    parts = [pipeline.environment for pipeline in (*PIPELINES.values(), POLYGONS)]
+    parts = [pipeline.environment for pipeline in PIPELINES.values()]
     parts += [pipeline.indirect for pipeline in PIPELINES.values()]
     parts += [getattr(part, "ends_in", None) for part in parts]
     for part in parts:
         name = type(part).__name__
-        if name in (*PIPELINES, "VisibilityPolygons"):
+        if name in PIPELINES:
             gi.bake(box(), part, camera=STILL).save(folder / f"{name}.bake.safetensors")
     for name in STATES:
         scheduler = test_forged_states.scheduler_of(name)
