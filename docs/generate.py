@@ -43,7 +43,7 @@ def named(name: str) -> Any:
 
 
 def attribute_docs(kind: type) -> dict[str, tuple[str, str]]:
-    """Return (annotation, docstring) of each documented attribute of a class and its bases, by name."""
+    """Return (annotation, docstring) of each documented setting of a class and its bases, by name."""
     found: dict[str, tuple[str, str]] = {}
     for base in reversed(kind.__mro__):
         if not dataclasses.is_dataclass(base):
@@ -52,6 +52,7 @@ def attribute_docs(kind: type) -> dict[str, tuple[str, str]]:
         for node, after in zip(body, [*body[1:], None], strict=True):
             if (
                 isinstance(node, ast.AnnAssign)
+                and not ast.unparse(node.annotation).startswith("ClassVar")
                 and isinstance(after, ast.Expr)
                 and isinstance(after.value, ast.Constant)
             ):

@@ -86,6 +86,17 @@ def test_deep_files_are_refused(tmp_path, capfd):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="names are Unicode there")
+def test_ends_of_lines_in_names_of_channels_end_no_line(tmp_path):
+    """A sky whose channels are named so, by damage or on purpose; found by the campaign of mutated files."""
+    write_exr(tmp_path / "a.exr", {"beauty": np.ones((4, 8, 3))}, {})
+    data = (tmp_path / "a.exr").read_bytes()
+    assert data.count(b"G\0\1") == 1
+    (tmp_path / "a.exr").write_bytes(data.replace(b"G\0\1", b"\n\0\1"))
+    with pytest.raises(SceneError, match="no layer has red, green and blue") as caught:
+        gi.Environment.load(tmp_path / "a.exr")
+    assert len(str(caught.value).splitlines()) == 1
+
+
 def test_names_that_are_not_utf8(tmp_path, capfd):
     """As the name of a sky, a scene, a camera path, a folder, frames, a bake, and of what is missing."""
     folder = tmp_path / NOT_UTF8

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import subprocess
 import sys
 
@@ -40,6 +41,12 @@ def path_file(folder, **fields):
         (["--eye", "1e16", "1", "3", "--target", "0", "1", "0"], "its position must be within 1e+15 m"),
         (["--exposure", "1e6", "--preview"], "exposure must be from -100 to 100 stops, got 1e+06"),
         (["--exposure", "nan", "--preview"], "exposure must be from -100 to 100 stops, got nan"),
+        (["--frames", "9" * 12], "numbers must be at most 2,147,483,647"),
+        (["--frames", "0-" + "9" * 5000], "not understood"),
+        (["--resolution", "99999999999x2"], "resolution must be at most 65536 a side"),
+        (["--resolution", "9" * 400 + "x2"], "not understood"),
+        (["--resolution", "40000x40000"], "1,073,741,824 pixels, got 40000x40000"),
+        (["--memory", "nan"], "memory must be a number of bytes above 0, got nan"),
     ],
 )
 def test_numbers_that_are_too_large_are_one_line(tmp_path, capfd, options, words):
@@ -181,7 +188,24 @@ FAULTS = [
 ]
 
 
-@pytest.mark.parametrize("command", ["render", "bake", "compare", "info", "bench"])
+def test_numbers_of_frames_and_pixels_in_programs():
+    box, path = gi.builtin_scene("cornell_box"), gi.builtin_camera_path("cornell_box").at_resolution(8, 6)
+    with pytest.raises(OptionError, match=r"frame numbers must be at most 2,147,483,647, got 100000000000000\.\.\."):
+        next(gi.render(box, path, gi.Pipeline(spp=1), frames=[10**400]))
+    for size in ((10**400, 2), (2, 10**12), (1 << 15, 1 << 16), (0, 1), ("a", 1), 5, (float("inf"), 2)):
+        for camera in (path, path.camera(0)):
+            with pytest.raises(OptionError, match="resolution must be"):
+                camera.at_resolution(*(size if isinstance(size, tuple) else (size, 0)))
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+def test_a_full_standard_output_is_named():
+    command = f'"{sys.executable}" -m warp_gi.cli info cornell_box > /dev/full'
+    done = subprocess.run(command, shell=True, timeout=300, check=False, capture_output=True, text=True)
+    assert done.returncode == 1 and done.stderr == "warp-gi: error: standard output: No space left on device\n"
+
+
+@pytest.mark.parametrize("command", ["render", "bake", "compare", "info", "bench", "video"])
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: type(fault).__name__)
 def test_whatever_a_command_lets_out_is_one_line(monkeypatch, capfd, command, fault):
     module = __import__(f"warp_gi.cli.{command}", fromlist=["main"])

@@ -24,6 +24,7 @@ PIPELINES = {
     "RadianceTransfer": gi.Pipeline(
         gi.RadianceTransfer(resolution=64, first_rays=16, rays=16, bounces=1), indirect=None, spp=1
     ),
+    "VisibilityPolygons": gi.Pipeline.preset("polygons", spp=1),
 }
 
 

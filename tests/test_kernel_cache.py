@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
+import multiprocessing
 import os
 import shutil
 import subprocess
 import sys
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -32,9 +35,15 @@ class Module:
     def load(self, device, block):
         code = self.folder / "code.o"
         if not code.exists():
-            self.folder.mkdir(exist_ok=True)
-            code.write_bytes(b"machine code")
+            made = self.folder.with_name(f"one_p{os.getpid()}")
+            made.mkdir()
+            (made / code.name).write_bytes(b"machine code")
+            time.sleep(0.02)
             self.compiled += 1
+            try:
+                os.rename(made, self.folder)  # as Warp does
+            except OSError:  # another process got there first
+                shutil.rmtree(made)
         if not code.read_bytes().startswith(b"machine"):
             raise Exception("Failed to load CPU module 'one'")  # as Warp does
 
@@ -70,6 +79,50 @@ def test_damaged_sums_are_made_again(module):
         before = module.compiled
         kernel_cache.load(module, CPU, 1)
         assert module.compiled == before + 1 and "code.o" in json.loads((module.folder / kernel_cache.SUMS).read_text())
+
+
+def test_what_another_process_mends_meanwhile_is_left_alone(module, monkeypatch, caplog):
+    """Both find the damage; the later one takes what the first one made, and removes nothing."""
+    (module.folder / "code.o").write_bytes(b"noise")
+    alone = kernel_cache._alone
+
+    @contextlib.contextmanager
+    def after_another(folder):
+        with alone(folder):
+            (folder / "code.o").write_bytes(b"machine code")
+            (folder / "its own").write_text("")
+            yield
+
+    monkeypatch.setattr(kernel_cache, "_alone", after_another)
+    kernel_cache.load(module, CPU, 1)
+    assert module.compiled == 1 and (module.folder / "its own").exists() and not caplog.messages
+
+
+def mend(module, gate, found):
+    gate.wait()
+    try:
+        kernel_cache.load(module, CPU, 1)
+        found.put((module.compiled, ""))
+    except Exception as error:
+        found.put((module.compiled, repr(error)))
+
+
+def test_many_processes_mend_one_folder_at_once(module):
+    """Compiling and loading take a while, in which the folder of others must not go."""
+    context = multiprocessing.get_context("fork")
+    for content in (b"noise", b""):
+        (module.folder / "code.o").write_bytes(content)
+        gate, found = context.Barrier(6), context.Queue()
+        others = [context.Process(target=mend, args=(module, gate, found)) for _ in range(6)]
+        for one in others:
+            one.start()
+        got = [found.get(timeout=60) for _ in others]
+        for one in others:
+            one.join()
+        assert [problem for _, problem in got if problem] == []
+        assert sum(compiled - module.compiled for compiled, _ in got) >= 1
+        assert (module.folder / "code.o").read_bytes() == b"machine code"
+        assert not list(module.folder.parent.glob("*.damaged"))
 
 
 def test_a_kernel_that_does_not_compile_is_an_error_at_once(module):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import errno
+import re
 from collections.abc import Iterable
 from numbers import Integral
 from typing import TYPE_CHECKING
@@ -17,12 +18,19 @@ FARTHEST_VERTEX = 1e12
 """Metres beyond which products of three lengths leave float32, by which rays are tested against triangles."""
 OF_MACHINE = {"ENOSPC", "EDQUOT", "EIO", "ENOMEM", "ESTALE", "EMFILE", "ENFILE", "EPIPE", "ETIMEDOUT"}
 """Errors of the system that no argument is to blame for."""
+_BREAKS = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+")
 MOST_NAMES = 64
 """Known names that an error lists."""
 
 
 class GiError(ValueError):
-    """Base of every error that says what was expected, what came and what to do."""
+    """Base of every error that says what was expected, what came and what to do.
+
+    It is one line: ends of lines in names that it quotes, and other characters that move the cursor, become spaces.
+    """
+
+    def __init__(self, *message: object) -> None:
+        super().__init__(*(_BREAKS.sub(" ", one) if isinstance(one, str) else one for one in message))
 
 
 class SceneError(GiError):

@@ -14,6 +14,7 @@ import tempfile
 import time
 import uuid
 from collections.abc import Iterator
+from contextvars import ContextVar
 from pathlib import Path
 
 from warp_gi.errors import OptionError
@@ -22,6 +23,8 @@ OLD = 86_400.0
 """Seconds after which a temporary file of another machine is taken for one of a killed process."""
 _in_use: set[str] = set()
 """Names of the temporary files that threads of this process are writing."""
+_claim: ContextVar[Path | None] = ContextVar("claim", default=None)
+"""File without which nothing is written here (``writing_under``)."""
 
 
 def user_path(path: str | os.PathLike[str]) -> Path:
@@ -54,6 +57,30 @@ def check_replaceable(path: Path) -> None:
 
 
 @contextlib.contextmanager
+def writing_under(claim: Path | None) -> Iterator[None]:
+    """Let files appear within the block only as long as the file ``claim`` is there; None asks for none.
+
+    ``replacing`` looks for it when all is written, just before the file gets its name, and raises OSError without it.
+    """
+    before = _claim.set(claim)
+    try:
+        yield
+    finally:
+        _claim.reset(before)
+
+
+def _check_claim(path: Path) -> None:
+    claim = _claim.get()
+    if claim is None:
+        return
+    try:
+        os.close(os.open(claim, os.O_RDONLY))  # a network's disk asks its server when a file is opened, not before
+    except FileNotFoundError:
+        problem = "is left as it is: the run that this frame is of has ended, or another one has taken its place"
+        raise OSError(errno.ESTALE, problem, str(path)) from None
+
+
+@contextlib.contextmanager
 def replacing(path: str | Path, own_folder: bool = False) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` to write to; it is renamed to ``path`` if the block succeeds.
 
@@ -77,6 +104,7 @@ def replacing(path: str | Path, own_folder: bool = False) -> Iterator[Path]:
         file.chmod(mode)  # some writers replace the file by one that its owner alone may read
         with open(file, "rb+") as written:
             os.fsync(written.fileno())
+        _check_claim(path)
         os.replace(file, path)
     except BaseException as error:
         _remove(part)

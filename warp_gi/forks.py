@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import sys
 import threading
 import weakref
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+_Owner = TypeVar("_Owner", bound=Any)
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
 
 _guards: weakref.WeakSet[Guard] = weakref.WeakSet()
 has_lost_cuda = False
@@ -25,6 +31,19 @@ class Guard:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Guard, ()
+
+
+def holds_scene(
+    method: Callable[Concatenate[_Owner, _Arguments], _Result],
+) -> Callable[Concatenate[_Owner, _Arguments], _Result]:
+    """Return a method during which no other thread moves, edits or renders the object's scene."""
+
+    @functools.wraps(method)
+    def holding(self: _Owner, /, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        with self.scene.lock:
+            return method(self, *args, **kwargs)
+
+    return holding
 
 
 def _after_fork() -> None:

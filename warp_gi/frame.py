@@ -138,12 +138,7 @@ class Frame:
         self.apart: ApartLights | None = None
         """Lights whose diffuse light paths keep apart; known once they are traced."""
         self._offers: dict[type, Any] = {}
-        width, height = camera.resolution
-        count = width * height
-
-        def zeros(dtype: type) -> wp.array:
-            return wp.zeros(count, dtype=dtype, device=device)
-
+        zeros = self._zeros
         self._arrays: dict[str, wp.array] = {name: zeros(wp.vec3) for name in _VEC3_BUFFERS}
         self._arrays |= {
             "alpha": zeros(wp.float32),
@@ -197,6 +192,11 @@ class Frame:
 
     # ---- buffers ----
 
+    def _zeros(self, dtype: type) -> wp.array:
+        """Return a new buffer of all pixels on the frame's device."""
+        width, height = self.camera.resolution
+        return wp.zeros(width * height, dtype=dtype, device=self.device)
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the buffers: ``BUFFERS``, and with a denoiser "noisy", the beauty before it."""
@@ -230,7 +230,7 @@ class Frame:
             raise unknown_name("term", name, TERMS)
         if self._arrays.get(f"{name}_moment1") is None:
             for order in (1, 2):
-                self._arrays[f"{name}_moment{order}"] = wp.zeros_like(self._arrays[name])
+                self._arrays[f"{name}_moment{order}"] = self._zeros(wp.vec3)
         return self._arrays[f"{name}_moment1"], self._arrays[f"{name}_moment2"]
 
     def layer_emission(self) -> wp.array:
@@ -239,7 +239,7 @@ class Frame:
         vec3 [height * width]; paths then take it for that of the surface drawn, in the moments of what they add up.
         """
         if "layer_emission" not in self._arrays:
-            self._arrays["layer_emission"] = wp.zeros_like(self._arrays["emission"])
+            self._arrays["layer_emission"] = self._zeros(wp.vec3)
         return self._arrays["layer_emission"]
 
     def lobes(self) -> Lobes | None:
@@ -251,7 +251,7 @@ class Frame:
             return None
         for name in ("lobe_diffuse", "lobe_glossy"):
             if name not in self._arrays:
-                self._arrays[name] = wp.zeros_like(self._arrays["indirect"])
+                self._arrays[name] = self._zeros(wp.vec3)
         return Lobes(self._arrays["lobe_diffuse"], self._arrays["lobe_glossy"], self._arrays.get("lobe_apart"))
 
     def keep_noisy(self) -> None:
@@ -340,7 +340,7 @@ class Frame:
             setattr(samplers, name, getattr(request, name).data)
         for name in ("moment1", "moment2"):  # a frame that was done has none left
             if name not in self._arrays:
-                self._arrays[name] = wp.zeros_like(self._arrays["indirect"])
+                self._arrays[name] = self._zeros(wp.vec3)
         buffers = self.struct(path_trace.PathBuffers)
         inputs = [self.data, self.camera_data, self.pass_settings, settings, self.hits, buffers, samplers]
         self.launch_tiled(tracer.trace_paths, inputs)

@@ -13,6 +13,7 @@ import json
 import logging
 import os
 import shutil
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,11 @@ from typing import Any
 import warp as wp
 
 from warp_gi.errors import one_line
+
+try:
+    import fcntl
+except ImportError:  # Windows: processes that mend the same folder at once may compile it twice
+    fcntl = None  # type: ignore[assignment]
 
 VARIABLE = "WARP_CACHE_PATH"
 """Environment variable by which Warp keeps compiled kernels elsewhere."""
@@ -42,25 +48,63 @@ def start() -> None:
 def load(module: Any, device: wp.Device, block: int) -> None:
     """Load a module, compiled before or now; one that is damaged in the cache is compiled again, and a line says so.
 
-    Raises OSError where what is compiled cannot be kept: Warp runs it from there.
+    Of several processes that find the damage at once one compiles, and the others take what it made. Raises OSError
+    where what is compiled cannot be kept: Warp runs it from there.
     """
     folder = Path(wp.config.kernel_cache_dir or "") / module.get_module_identifier(block)
-    problem = _changed(folder)
-    if not problem:
-        was_there = folder.is_dir()
-        try:
-            _load(module, device, block, folder)
+    if not _problem(module, device, block, folder):
+        return
+    with _alone(folder):
+        module.failed_builds.clear()
+        problem = _problem(module, device, block, folder)
+        if not problem:  # another process has mended it
             return
-        except OSError:
+        _LOG.warning("compiled kernels are damaged in %s (%s): they are compiled again", folder, problem)
+        _remove(folder)
+        module.failed_builds.clear()
+        _load(module, device, block, folder)
+
+
+def _problem(module: Any, device: wp.Device, block: int, folder: Path) -> str:
+    """Load a module; return what is damaged in its folder, or "" if it is loaded."""
+    problem = _changed(folder)
+    if problem:
+        return problem
+    was_there = folder.is_dir()
+    try:
+        _load(module, device, block, folder)
+    except FileNotFoundError as error:  # another process has just removed it
+        return one_line(error)
+    except OSError:
+        raise
+    except Exception as error:
+        if not was_there:
             raise
-        except Exception as error:
-            if not was_there:
-                raise
-            problem = one_line(error, type(error).__name__)
-    _LOG.warning("compiled kernels are damaged in %s (%s): they are compiled again", folder, problem)
-    shutil.rmtree(folder, ignore_errors=True)
-    module.failed_builds.clear()
-    _load(module, device, block, folder)
+        return one_line(error, type(error).__name__)
+    return ""
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Keep other processes from mending the same folder; where there are no locks, do nothing."""
+    try:
+        file = os.open(folder.with_name(f".{folder.name}.lock"), os.O_CREAT | os.O_RDWR, 0o666)
+    except OSError as error:
+        raise _unwritable(folder.parent, error) from error
+    try:
+        with contextlib.suppress(OSError, AttributeError):  # a file system without locks
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(file)
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder at once: who looks at it sees all of it, or nothing."""
+    aside = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}.damaged")
+    with contextlib.suppress(FileNotFoundError):
+        os.rename(folder, aside)
+    shutil.rmtree(aside, ignore_errors=True)
 
 
 def _load(module: Any, device: wp.Device, block: int, folder: Path) -> None:

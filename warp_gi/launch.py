@@ -176,9 +176,14 @@ def _load_here(kernel: wp.Kernel, device: wp.Device) -> None:
 
 
 def launch(
-    kernel: wp.Kernel, count: int, inputs: Sequence[object], device: wp.Device, smallest_slice: int = SMALLEST_SLICE
+    kernel: wp.Kernel,
+    count: int,
+    inputs: Sequence[object],
+    device: wp.Device,
+    smallest_slice: int = SMALLEST_SLICE,
+    first: int = 0,
 ) -> None:
-    """Run ``kernel`` over items 0 to ``count`` - 1.
+    """Run ``kernel`` over ``count`` items from ``first`` on.
 
     ``inputs`` are the arguments after ``first``. Raises TypeError when an argument's
     type, dtype, rank or device is not what the kernel declares, OptionError for CUDA in
@@ -194,11 +199,11 @@ def launch(
             wp.launch(kernel, dim=1, inputs=[0, *inputs], device=device, record_tape=False, record_cmd=True)
         _bound.setdefault(kernel, set()).add(device.alias)
     if device.is_cuda:
-        wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device, record_tape=False)
+        wp.launch(kernel, dim=count, inputs=[first, *inputs], device=device, record_tape=False)
         return
     threads = thread_count()
     slice_count = min(threads * SLICES_PER_THREAD if threads > 1 else 1, -(-count // smallest_slice))
-    bounds = list(itertools.pairwise(count * i // slice_count for i in range(slice_count + 1)))
+    bounds = list(itertools.pairwise(first + count * i // slice_count for i in range(slice_count + 1)))
 
     def run(index: int) -> None:
         begin, end = bounds[index]

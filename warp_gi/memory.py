@@ -48,16 +48,29 @@ def check_picture(resolution: tuple[int, int], is_denoised: bool, device: wp.Dev
     Counted are its own buffers, those of a denoiser and its history, and on the CPU the file that is written. What
     scene and bakes take is not known yet.
     """
-    width, height = resolution
-    needed = width * height * (DENOISED_BYTES if is_denoised else PLAIN_BYTES)
-    free = device.free_memory if device.is_cuda else free_memory()
+    needed, free = picture_bytes(resolution, is_denoised), left_on(device)
     if free is not None and needed > free:
-        each = needed // (width * height)
         raise OptionError(
-            f"a picture of {width}x{height} takes about {gigabytes(needed)} of memory ({each} bytes a pixel), and"
-            f" {gigabytes(free)} are free on {device.alias}; render fewer pixels, or parts of the picture"
-            + (", or without a denoiser" if is_denoised else "")
+            f"{too_large(resolution, is_denoised)}, and {gigabytes(free)} are free on {device.alias}; render fewer"
+            " pixels" + (", or without a denoiser" if is_denoised else "")
         )
+
+
+def picture_bytes(resolution: tuple[int, int], is_denoised: bool) -> int:
+    """Return the bytes that a picture takes at most while it is rendered and written."""
+    return resolution[0] * resolution[1] * (DENOISED_BYTES if is_denoised else PLAIN_BYTES)
+
+
+def left_on(device: wp.Device) -> int | None:
+    """Return the bytes that are free on a device; None where nothing says so."""
+    return device.free_memory if device.is_cuda else free_memory()
+
+
+def too_large(resolution: tuple[int, int], is_denoised: bool) -> str:
+    """Return what a picture takes, in words."""
+    needed, each = picture_bytes(resolution, is_denoised), DENOISED_BYTES if is_denoised else PLAIN_BYTES
+    size = "x".join(map(str, resolution))
+    return f"a picture of {size} takes about {gigabytes(needed)} of memory ({each} bytes a pixel)"
 
 
 def gigabytes(count: int) -> str:

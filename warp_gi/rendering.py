@@ -50,6 +50,7 @@ def render(
     chunk: str | tuple[int, int] | None = None,
     warm_up: int | None = None,
     cluster: object = None,
+    memory: float | None = None,
 ) -> Iterator[Frame]:
     """Yield the frames of a sequence, and write them to files if there is an ``output``.
 
@@ -92,6 +93,10 @@ def render(
             all see the folder of ``output``. What is yielded then are ``FrameFile``s, in order, as read from the files.
             Frames are equal, bit for bit, to those of this process.
 
+        memory: Bytes that a picture may take; None is what is free. A larger one is rendered in bands of its rows, to
+            the same bits, if it goes to an ``output`` and the pipeline can ("path", "direct" and "cache", without a
+            denoiser). What is yielded then reads the file when it is asked for a buffer.
+
     Raises OptionError for a device that is not there, a negative frame or seed, files that frames cannot be, several
     frames for one file, or files that another process is writing; BakeError for a bake of another scene or other
     settings; SceneError for a scene that was edited so that pictures would not show it; OSError for files that cannot
@@ -111,7 +116,8 @@ def render(
         check_seconds(frame_time)
     wanted = _frame_numbers(camera, frames)
     with shown(progress, len(wanted)) as told:
-        scheduler = FrameScheduler(scene, camera, _chosen(pipeline, scene), device, seed, told, bakes, cache)
+        of_scene = scene, camera, _chosen(pipeline, scene), device, seed
+        scheduler = FrameScheduler(*of_scene, told, bakes, cache, memory)
         camera = scheduler.camera
         launch.load_ahead(kernels_of(scheduler.pipeline, scheduler.scene), scheduler.device)
         if output is None:
@@ -141,7 +147,7 @@ def render(
             for shot in plan.todo:
                 frame = run.render(shot)
                 run.save_state(shot, frame)
-                yield frame
+                yield cast("Frame", frame)
                 del frame  # before there is a next one
         finally:
             run.finish()

@@ -6,23 +6,22 @@ import copy
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import wraps
+from functools import partial
 from numbers import Integral
 from pathlib import Path
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 import warp_gi
-from warp_gi import launch
+from warp_gi import bands, launch
 from warp_gi.baking import Bake, Setting, load_bake
-from warp_gi.denoise import Denoiser
 from warp_gi.errors import BakeError, OptionError, unknown_name
 from warp_gi.forecast import tell_cost
+from warp_gi.forks import holds_scene
 from warp_gi.frame import Frame, mixed_seed, timed
 from warp_gi.kept import BakeFolder, bakes_by_class, cached_bake
 from warp_gi.kernels import compose, types
-from warp_gi.memory import check_picture
 from warp_gi.pipeline import DENOISER, Pipeline
 from warp_gi.primary import CameraRays
 from warp_gi.scene.baked import BakedScene, whole_scene
@@ -33,21 +32,7 @@ from warp_gi.scene.sky_motion import sky_start
 from warp_gi.sequence.state import Dependence, loaded_states, state_arrays
 from warp_gi.stateful import Ahead, Stateful
 
-_Arguments = ParamSpec("_Arguments")
-_Result = TypeVar("_Result")
-
-
-def _holds_scene(
-    method: Callable[Concatenate[FrameScheduler, _Arguments], _Result],
-) -> Callable[Concatenate[FrameScheduler, _Arguments], _Result]:
-    """Return a method during which no other thread moves, edits or renders the scene."""
-
-    @wraps(method)
-    def holding(self: FrameScheduler, /, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        with self.scene.lock:
-            return method(self, *args, **kwargs)
-
-    return holding
+_AnyFrame = TypeVar("_AnyFrame", bound=Frame)
 
 
 class FrameScheduler:
@@ -62,6 +47,7 @@ class FrameScheduler:
         progress: Called with (stage, share done in [0, 1]) while baking and tracing.
         bakes: Bakes made before (``gi.bake``, ``gi.load_bake``), each for the estimators that it names.
         cache: Folder in which bakes that take long are kept, and found the next time; None keeps none.
+        memory: Bytes that a picture may take; a larger one goes to files in bands of ``rows``. None is what is free.
 
     Several may render one scene, in turns or on threads of their own: a frame has the scene to itself until it is
     done. Each is for one thread at a time.
@@ -79,6 +65,7 @@ class FrameScheduler:
         progress: Callable[[str, float], None] | None = None,
         bakes: Iterable[Bake] = (),
         cache: BakeFolder | str | Path | None = None,
+        memory: float | None = None,
     ) -> None:
         bakes = list(bakes)
         if isinstance(scene, Bake):
@@ -100,7 +87,8 @@ class FrameScheduler:
         if isinstance(self.scene, Scene):
             warn_if_far(self.camera, self.scene)
         self.device = launch.get_device(device)
-        check_picture(self.camera.resolution, self.pipeline.denoise is not None, self.device)
+        self.memory = memory
+        self.rows = bands.band_rows(self.pipeline, self.scene, self.camera.resolution, self.device, memory)
         self._progress = progress or (lambda stage, share: None)
         self._parts = self.pipeline.parts()
         self._bakes = bakes_by_class(bakes, self._parts)
@@ -112,7 +100,7 @@ class FrameScheduler:
         if self.pipeline.denoise is not None:  # first of all: it says if it is not installed
             self._start_part(DENOISER, self.pipeline.denoise)
         self._frames: int | None = None
-        self._bake_seconds, self._baked_version, self._scene_hash = 0.0, -1, ""
+        self.bake_seconds, self._baked_version, self._moved, self._scene_hash = 0.0, -1, 0, ""
         self._trail: Trail | None = None
         self._sky_time = sky_start(self.scene.sky_at)
         self._frame_time: float | None = None
@@ -131,7 +119,7 @@ class FrameScheduler:
 
     # ---- before the first frame ----
 
-    @_holds_scene
+    @holds_scene
     def bake(self, sky_time: float | None = None, frames: int | None = None) -> None:
         """Let every part compute what it can before the first frame; done by the first frame otherwise.
 
@@ -144,6 +132,9 @@ class FrameScheduler:
         self._sky_time = self._sky_time if sky_time is None else sky_time
         self.scene.update_sky(self._sky_time)  # whoever rendered another time of the scene since
         if self._baked_version == self.scene.version:
+            if self._moved != self.scene.moved:  # every part follows other keyframes, and so do hashes
+                self._keys = {place: self._state_key(part) for place, part in self._parts.items()}
+                self._moved, self._scene_hash = self.scene.moved, self.scene.hash
             return
         started = time.perf_counter()
         self._made.clear()
@@ -152,14 +143,17 @@ class FrameScheduler:
         for place, part in self._parts.items():
             self._start_part(place, part)
         self._scene_hash = self.scene.hash
-        self._bake_seconds = time.perf_counter() - started
-        self._baked_version = self.scene.version
+        self.bake_seconds = time.perf_counter() - started
+        self._baked_version, self._moved = self.scene.version, self.scene.moved
 
     def _start_part(self, place: str, part: Stateful) -> None:
         """Start a part, unless all that it depends on is what it was."""
-        key = part.state_key(self.scene) or self._key_of(part)
+        key = self._state_key(part)
         if self._keys.get(place) != key:
             self._states[place], self._keys[place] = self._start(place, part), key
+
+    def _state_key(self, part: Stateful) -> str:
+        return part.state_key(self.scene) or self._key_of(part)
 
     def _start(self, place: str, part: Stateful) -> Any:
         """Return a part's state before the first frame, from a bake made before or now."""
@@ -220,12 +214,13 @@ class FrameScheduler:
 
     # ---- frames ----
 
-    @_holds_scene
+    @holds_scene
     def frame(self, index: int, previous_index: int | None = None) -> Frame:
         """Render frame ``index``; motion is towards frame ``previous_index`` (None: the frame before it, if any).
 
         A frame that an exception interrupts leaves nothing behind: what is rendered next is as if it had not begun.
         """
+        bands.check_whole(self.rows, self.camera.resolution)
         index, began, timings = int(index), time.perf_counter(), {"bake": 0.0, "compile": 0.0}
         with timed(timings, "scene", self.device):
             self.scene.check_unchanged()
@@ -235,11 +230,41 @@ class FrameScheduler:
         if previous_index is None:
             previous_index = max(index - 1, 0)
         with timed(timings, "scene", self.device):
-            frame = self._new_frame(index, previous_index)
+            frame = self._new_frame(index, previous_index, Frame)
         frame.timings = timings
-        states, denoiser = dict(self._states), self._parts.get(DENOISER)
-        if isinstance(denoiser, Denoiser):
-            frame.settings = replace(frame.settings, spp=denoiser.samples(frame, states[DENOISER]))
+        states = self._traced(frame)
+        for place, part in self._parts.items():
+            if part.learns:
+                with frame.stage(f"learn {place}"):
+                    states[place] = part.after(frame, states[place])
+        if self.pipeline.denoise is not None:
+            with frame.stage("denoise"):
+                frame.keep_noisy()
+                states[DENOISER] = self.pipeline.denoise.apply(frame, states[DENOISER])
+        self._states, self._trail = states, self.scene.trail_of(index, self.device)  # all or nothing
+        frame.finish()
+        timings["scheduler"] = max(time.perf_counter() - began - sum(timings.values()), 0.0)
+        timings["bake"] = self.bake_seconds
+        return frame
+
+    def band(self, index: int, previous_index: int, rows: range) -> bands.BandFrame:
+        """Return some rows of a frame, as ``sequence.banded`` asks for them."""
+        timings: dict[str, float] = {}
+        with timed(timings, "scene", self.device):
+            frame = self._new_frame(index, previous_index, partial(bands.BandFrame, rows=rows))
+        frame.timings = timings
+        self._traced(frame)
+        if rows.stop == self.camera.resolution[1]:
+            self._trail = self.scene.trail_of(index, self.device)
+        frame.finish()
+        return frame
+
+    def _traced(self, frame: Frame) -> dict[str, Any]:
+        """Trace and compose a frame; return the states that its parts have in it."""
+        states = dict(self._states)
+        if self.pipeline.denoise is not None:
+            samples = self.pipeline.denoise.samples(frame, states[DENOISER])
+            frame.settings = replace(frame.settings, spp=samples)
         for place, part in self._parts.items():
             with frame.stage(f"preprocess {place}"):
                 states[place] = part.preprocess(frame, states[place])
@@ -249,19 +274,7 @@ class FrameScheduler:
             self._progress("trace", (view + 1) / views)
         with frame.stage("compose"):
             frame.launch(compose.compose_frame, [views, frame.settings.spp, frame.struct(compose.FrameSums)])
-        for place, part in self._parts.items():
-            if part.learns:
-                with frame.stage(f"learn {place}"):
-                    states[place] = part.after(frame, states[place])
-        if isinstance(denoiser, Denoiser):
-            with frame.stage("denoise"):
-                frame.keep_noisy()
-                states[DENOISER] = denoiser.apply(frame, states[DENOISER])
-        self._states, self._trail = states, self.scene.trail_of(index, self.device)  # all or nothing
-        frame.finish()
-        timings["scheduler"] = max(time.perf_counter() - began - sum(timings.values()), 0.0)
-        timings["bake"] = self._bake_seconds
-        return frame
+        return states
 
     def take_samples(self, spp: int, frame_time: float | None = None) -> None:
         """Take ``spp`` samples a pixel, and no more camera samples, from the next frame on, as fit into ``frame_time``.
@@ -280,13 +293,13 @@ class FrameScheduler:
         self.bake()
         other = copy.copy(self)
         other._progress = lambda stage, share: None
-        other.camera = self.camera.at_resolution(*resolution)
+        other.camera, other.rows = self.camera.at_resolution(*resolution), resolution[1]
         other.take_samples(spp)
         if previous_index != index:
             other.frame(previous_index)
         return other.frame(index, previous_index)
 
-    def _new_frame(self, index: int, previous_index: int) -> Frame:
+    def _new_frame(self, index: int, previous_index: int, make: Callable[..., _AnyFrame]) -> _AnyFrame:
         now = frame_time(self.camera, index)
         follows = self._trail is not None and self._trail.index == previous_index != index
         self.scene.update(now, frame_time(self.camera, previous_index), self.device, self._trail if follows else None)
@@ -296,7 +309,7 @@ class FrameScheduler:
             data.emitters.alias = whole_scene(self.scene).light_table(self.device)
         cameras = self._camera_at(index), self._camera_at(previous_index)
         settings, seed = self.pipeline.frame_settings, mixed_seed(self.seed, index)
-        frame = Frame(self.scene, data, *cameras, settings, self.device, index, now, seed, previous_index)
+        frame = make(self.scene, data, *cameras, settings, self.device, index, now, seed, previous_index)
         frame.estimators = dict(self.pipeline.estimators())
         frame.has_camera_rays = isinstance(self.pipeline.primary()[1], CameraRays)
         frame.metadata |= self.metadata()

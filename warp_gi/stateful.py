@@ -61,6 +61,11 @@ class Stateful:
     interrupted is rendered again from there. Nothing is kept anywhere but in the state.
     """
 
+    is_per_pixel: ClassVar[bool] = False
+    """Whether a large picture may be rendered in bands of its rows (``bands``), each as a frame of its own: that a
+    pixel's light depends on no other pixel, kernels run over pixels by ``Frame.launch`` and ``Frame.launch_tiled``, and
+    ``preprocess`` of one frame may be called again."""
+
     def __init_subclass__(cls, **more: Any) -> None:
         """Refuse methods of an earlier protocol, which nobody would call."""
         super().__init_subclass__(**more)

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import queue
 import random
+import resource
+import signal
 import struct
 import subprocess
 import sys
 import threading
+import time
+import traceback
 from collections import Counter
 from datetime import date
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 HERE = Path(__file__).parent
 COUNTS = HERE / "counts.json"
@@ -152,6 +160,24 @@ def glb_changed(data: bytes, chance: random.Random) -> bytes:
     )
 
 
+def forge(path: Path, target: Path, chance: random.Random) -> None:
+    """Write a bake or state with arrays or settings changed, and the seal of who knows how."""
+    sys.path.insert(0, str(HERE.parent))
+    from test_forged_states import forged, mutations
+
+    import warp_gi as gi
+
+    bake = gi.load_bake(path)
+    rng = np.random.default_rng(chance.getrandbits(32))
+    for name, _, arrays in itertools.islice(mutations(bake.arrays, rng), chance.choice([1, 1, 2])):
+        bake = forged(bake, bake.arrays | {name: arrays[name]})
+    for values in (bake.settings, bake.counts):
+        if values and chance.random() < 0.2:
+            values[chance.choice(sorted(values))] = chance.choice([0, -1, 1e30, 10**9, 0.5, 2**40])
+    with np.errstate(all="ignore"):
+        bake.save(target)
+
+
 # ---- a worker ----
 
 
@@ -217,15 +243,94 @@ class Worker:
             self.process = None
 
 
+# ---- commands in forks ----
+
+
+class Command:
+    """A command of warp-gi in a fork of this process, where modules and kernels are loaded: it may be killed.
+
+    Args:
+        arguments: Those of the command.
+        most_bytes: No file may become larger (RLIMIT_FSIZE), as on a disk that is full; None is no limit.
+        bakes: Folder in which bakes are kept, however short they took; None is the user's, with ``--no-cache`` none.
+    """
+
+    def __init__(self, arguments: list[str], most_bytes: int | None = None, bakes: Path | None = None) -> None:
+        self._said, said = os.pipe()
+        sys.stdout.flush()
+        self.process = os.fork()
+        if self.process == 0:
+            code = 70
+            try:
+                os.close(self._said)
+                for number in (1, 2):
+                    os.dup2(said, number)
+                sys.stdout, sys.stderr = (open(number, "w", closefd=False) for number in (1, 2))
+                code = self._run(arguments, most_bytes, bakes)
+            except BaseException:
+                traceback.print_exc()
+            finally:
+                sys.stderr.flush()
+                os._exit(code)
+        os.close(said)
+        self.code: int | None = None
+        self.said = ""
+
+    @staticmethod
+    def _run(arguments: list[str], most_bytes: int | None, bakes: Path | None) -> int:
+        from warp_gi import kept
+        from warp_gi.cli import main
+
+        if bakes is not None:
+            os.environ["WARP_GI_BAKES"], kept.LEAST_SECONDS = str(bakes), 0.0
+        if most_bytes is not None:
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+        return main.main(arguments)
+
+    def wait(self, seconds: float = 600.0) -> int | None:
+        """Return the exit code, below 0 for a signal; None if it runs on after some seconds."""
+        until = time.monotonic() + seconds
+        while self.code is None:
+            process, status = os.waitpid(self.process, os.WNOHANG)
+            if process:
+                self.code = os.waitstatus_to_exitcode(status)
+                with open(self._said, encoding="utf-8", errors="replace") as pipe:
+                    self.said = pipe.read()
+            elif time.monotonic() > until:
+                return None
+            else:
+                time.sleep(0.002)
+        return self.code
+
+    def kill(self) -> None:
+        """Kill it (SIGKILL), and wait for that."""
+        os.kill(self.process, signal.SIGKILL)
+        self.wait()
+
+
+def run(arguments: list[str], **more: Any) -> Command:
+    """Run a command to its end."""
+    command = Command(arguments, **more)
+    if command.wait() is None:
+        command.kill()
+    return command
+
+
 # ---- counts ----
 
 
 def record(campaign: str, size: int, counts: Counter[str], note: str = "") -> None:
-    """Keep the counts of a campaign, and write the page of them, if WARP_GI_CAMPAIGN_PAGE is set."""
+    """Keep the counts of a campaign, and write the page of them, if WARP_GI_CAMPAIGN_PAGE is set.
+
+    WARP_GI_CAMPAIGN_ADD adds them to what is there, for campaigns that are run in parts with several seeds.
+    """
     print(f"{campaign}: {size} {dict(counts)} {note}")
     if not os.environ.get("WARP_GI_CAMPAIGN_PAGE"):
         return
     known = json.loads(COUNTS.read_text()) if COUNTS.is_file() else {}
+    if os.environ.get("WARP_GI_CAMPAIGN_ADD") and campaign in known:
+        size, counts = size + known[campaign]["size"], counts + Counter(known[campaign]["counts"])
     known[campaign] = {"size": size, "counts": dict(sorted(counts.items())), "note": note, "date": str(date.today())}
     COUNTS.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n")
     rows = [

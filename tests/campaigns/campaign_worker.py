@@ -9,9 +9,15 @@ import json
 import resource
 import sys
 import warnings
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import test_forged_states
+from test_forged_bakes import PIPELINES
+from test_forged_states import PIPELINES as STATES
 
 import warp_gi as gi
 from warp_gi.cli.compare import read_image
@@ -20,7 +26,6 @@ from warp_gi.errors import GiError
 from warp_gi.scene.files import images
 
 STILL = gi.Camera.look_at((0, 1, 3.2), (0, 1, 0), resolution=(8, 6))
-SECONDS_OF_STATE = 2
 _kept: dict[str, object] = {}
 
 
@@ -66,32 +71,34 @@ def as_camera(path: Path) -> np.ndarray:
 
 def as_bake(path: Path) -> np.ndarray:
     bake = gi.load_bake(path)
-    pipeline = gi.Pipeline.preset("dvf", spp=1, environment=gi.VisibilityField(cell_size=0.6))
+    pipeline = PIPELINES.get(bake.technique, PIPELINES["VisibilityField"])
     return next(gi.render(box(), STILL, pipeline, bakes=[bake])).numpy("beauty")
 
 
-def state_scheduler() -> gi.FrameScheduler:
-    keys = (gi.CameraKey(0.0, (0, 1, 3.2), (0, 1, 0)), gi.CameraKey(1.0, (0.1, 1, 3.1), (0, 1, 0)))
-    camera = gi.CameraPath(keys, resolution=(8, 6))
-    return gi.FrameScheduler(box(), camera, gi.Pipeline.preset("reuse", spp=2), seed=1)
-
-
-def as_state(path: Path) -> np.ndarray:
-    scheduler = state_scheduler()
+def as_state(path: Path, name: str) -> np.ndarray:
+    scheduler = test_forged_states.scheduler_of(name)
     scheduler.load_state(path, "x")
     return scheduler.frame(2, 1).numpy("beauty")
 
 
-READERS = {"scene": as_scene, "sky": as_sky, "image": as_image, "camera": as_camera, "bake": as_bake, "state": as_state}
+READERS = {"scene": as_scene, "sky": as_sky, "image": as_image, "camera": as_camera, "bake": as_bake}
+READERS |= {f"state-{name}": partial(as_state, name=name) for name in STATES}
 
 
 def seeds(folder: Path) -> None:
-    """Write a bake and a state."""
-    gi.bake(box(), gi.VisibilityField(cell_size=0.6), camera=STILL).save(folder / "seed.bake.safetensors")
-    scheduler = state_scheduler()
-    for index in (0, 1):
-        scheduler.frame(index)
-    scheduler.save_state(folder / "seed.state.safetensors", "x")
+    """Write a bake of each technique and states of several pipelines."""
+    parts = [pipeline.environment for pipeline in PIPELINES.values()]
+    parts += [pipeline.indirect for pipeline in PIPELINES.values()]
+    parts += [getattr(part, "ends_in", None) for part in parts]
+    for part in parts:
+        name = type(part).__name__
+        if name in PIPELINES:
+            gi.bake(box(), part, camera=STILL).save(folder / f"{name}.bake.safetensors")
+    for name in STATES:
+        scheduler = test_forged_states.scheduler_of(name)
+        for index in (0, 1):
+            scheduler.frame(index)
+        scheduler.save_state(folder / f"{name}.state.safetensors", "x")
 
 
 def answer(kind: str, path: str) -> dict[str, object]:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from campaign_tools import HERE, Worker, mutated, record, size_of
+from campaign_tools import HERE, Worker, forge, mutated, record, size_of
 
 pytestmark = pytest.mark.slow
 BAD = ("fault", "nan", "crash", "hang", "memory")
@@ -62,7 +62,8 @@ def seeds(tmp_path_factory):
         "b.json": ["camera"],
     }
     named |= {"a.off": ["scene"], "a.stl": ["scene"], "b.stl": ["scene"]}
-    named |= {"seed.bake.safetensors": ["bake"], "seed.state.safetensors": ["state"]}
+    named |= {path.name: ["bake"] for path in folder.glob("*.bake.safetensors")}
+    named |= {path.name: [f"state-{path.name.split('.')[0]}"] for path in folder.glob("*.state.safetensors")}
     found += [(folder / name, kind) for name, kinds in named.items() for kind in kinds]
     libraries = sorted(HERE.parent.joinpath("cases").rglob("*.mtl"))
     return found + [(path, "library") for path in libraries]
@@ -72,7 +73,7 @@ def test_mutated_files(seeds, tmp_path, pytestconfig):
     count, chance = size_of("mutations", 300), random.Random(size_of("seed", 1))
     by_suffix: dict[str, list[tuple[Path, str]]] = {}
     for path, kind in seeds:
-        by_suffix.setdefault("".join(path.suffixes[-1:]) + kind, []).append((path, kind))
+        by_suffix.setdefault(f"{path.suffix} {kind}" + f" {path.stem}" * (kind == "bake"), []).append((path, kind))
     worker, counts, bad = Worker(), Counter(), []
     for path, kind in seeds:  # unchanged, they are read: what is found later is not an old fault
         if kind != "library":
@@ -83,7 +84,10 @@ def test_mutated_files(seeds, tmp_path, pytestconfig):
         for number in range(count):
             path, kind = chance.choice(by_suffix[chance.choice(sorted(by_suffix))])
             made = tmp_path / f"{number}{path.suffix}"
-            made.write_bytes(mutated(path.read_bytes(), path.suffix, chance))
+            if path.suffix == ".safetensors" and chance.random() < 0.8:
+                forge(path, made, chance)
+            else:
+                made.write_bytes(mutated(path.read_bytes(), path.suffix, chance))
             asked = made
             if kind == "library":
                 asked, kind = tmp_path / f"{number}.obj", "scene"

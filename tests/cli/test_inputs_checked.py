@@ -38,6 +38,8 @@ def no_scene(monkeypatch):
         (["render", "cornell_box", "-o", "a.exr", "--vfov=190"], "--vfov must be between 0 and 180 degrees, got 190"),
         (["render", "cornell_box", "-o", "a.exr", "--ortho=0"], "--ortho must be a width above 0 m, got 0"),
         (["bake", "cornell_box", "-o", "kept.safetensors"], "kept.safetensors: is read-only"),
+        (["bake", "cornell_box", "-o", "a.safetensors", "--vfov=190"], "--vfov must be between 0 and 180 degrees, got"),
+        (["bake", "cornell_box", "-o", "a.safetensors", "--eye", "0", "1", "2"], "--eye and --target go together"),
         (["render", ""], "the argument is empty (a variable that is not set?); give a value, or leave it out"),
         (["render", "cornell_box", "--environment", ""], "the argument after --environment is empty"),
         (["render", "cornell_box", "--environment="], "the argument of --environment is empty"),

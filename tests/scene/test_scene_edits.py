@@ -505,6 +505,68 @@ def test_keyframes_of_a_node_that_moves_are_read_for_every_frame():
     np.testing.assert_allclose(moved, beauties(late, [4])[0], atol=1e-4)
 
 
+FITTED = [Keyframe(0.0, (4.0, 0.0, 0.0)), Keyframe(2.0)]  # within the bounds of SLIDE
+
+
+def test_hashes_know_edited_keyframes_and_states_follow_them():
+    """A new scheduler is of another scene; one that goes on keeps what it has, under another sky too."""
+    scene = parts(moving=True)
+    pipeline = replace(PIPELINE, emitters=gi.UniformLights())
+    scheduler = gi.FrameScheduler(scene, PATH, pipeline)
+    first, table = scheduler.frame(0), scheduler.state("emitters")
+    hashes = {"as built": scene.hash}
+    edits = {
+        "keyframes": lambda: setattr(scene.nodes[5], "keyframes", FITTED),
+        "in place": lambda: scene.nodes[5].keyframes.__setitem__(1, Keyframe(2.0, (1.0, 0.0, 0.0))),
+        "a node that hangs on it": lambda: setattr(scene.nodes[6], "parent_from_node", shifted(0.5, z=0.125)),
+    }
+    for name, edit in edits.items():
+        edit()
+        frame = scheduler.frame(0)
+        assert frame.metadata["scene_hash"] == scene.hash != scene.geometry_hash
+        assert scene.hash not in hashes.values(), name
+        hashes[name] = scene.hash
+    scene.environment = 0.5
+    scheduler.frame(0)
+    assert scheduler.state("emitters") is table and first.metadata["scene_hash"] == hashes["as built"]
+    scene.environment = parts().environment
+    scene.nodes[5].keyframes, scene.nodes[6].parent_from_node = list(SLIDE), shifted(0.0, z=0.125)
+    scene.check_unchanged()
+    assert scene.hash == hashes["as built"] == parts(moving=True).hash
+
+
+def test_a_resting_node_above_one_that_moves_is_in_the_hash():
+    def rail(x):
+        cabin = Node("cabin", [triangle(Material("steel"))], parent=0, keyframes=SLIDE)
+        return gi.Scene([Node("rail", parent_from_node=shifted(x)), cabin, parts().nodes[0]], environment=1.0)
+
+    scene = rail(0.0)
+    next(gi.render(scene, CAMERA, PIPELINE))
+    before = scene.hash
+    assert before == rail(0.0).hash
+    scene.nodes[0].parent_from_node = shifted(0.5)
+    scene.check_unchanged()
+    assert scene.hash != before
+
+
+EDITED = {
+    "keyframes": lambda scene: setattr(scene.nodes[5], "keyframes", FITTED),
+    "a colour": lambda scene: setattr(paint(scene), "base_color", (0.1, 0.9, 0.1)),
+}
+
+
+@pytest.mark.parametrize("edit", EDITED.values(), ids=EDITED)
+def test_frames_of_a_scene_before_an_edit_are_not_taken_for_done(tmp_path, edit):
+    scene, where = parts(moving=True), {"frames": [0, 4], "output": tmp_path / "a.####.exr"}
+    list(gi.render(scene, PATH, PIPELINE, **where))
+    assert gi.plan_sequence(scene, PATH, PIPELINE, **where).frames == ()
+    edit(scene)
+    plan = gi.plan_sequence(scene, PATH, PIPELINE, **where)
+    assert plan.frames == (0, 4) and "scene_hash is" in plan.reason(0)
+    assert [frame.index for frame in gi.render(scene, PATH, PIPELINE, resume=True, **where)] == [0, 4]
+    assert gi.plan_sequence(scene, PATH, PIPELINE, **where).frames == ()
+
+
 def test_animate_takes_edits_over():
     scene = parts()
     no_alarm(scene)

@@ -387,6 +387,43 @@ def test_clean_frames_follow_a_pose_and_begin_anew_with_a_color():
     assert np.isfinite(frame.numpy("beauty")).all()
 
 
+DENOISED = gi.Pipeline(spp=1, denoise="spatiotemporal")
+
+
+def test_a_history_goes_on_in_a_process_that_begins_with_the_edited_scene(tmp_path):
+    """Light is hashed without edits of poses while a process goes on; another one knows nothing of them."""
+    scene = robot()
+    scheduler = gi.FrameScheduler(scene, CAMERA, DENOISED)
+    scheduler.frame(0)
+    scene.nodes[1].parent_from_node = moved(-0.45, 0.2)
+    scheduler.frame(1)
+    scheduler.save_state(tmp_path / "a.safetensors", "x")
+    wanted = scheduler.frame(2).numpy("beauty")
+    for other in (fresh(scene), scene):
+        later = gi.FrameScheduler(other, CAMERA, DENOISED)
+        later.load_state(tmp_path / "a.safetensors", "x")
+        np.testing.assert_array_equal(later.frame(2).numpy("beauty"), wanted)
+    scene.environment = (0.1, 0.3, 0.4)
+    late = gi.FrameScheduler(scene, CAMERA, DENOISED)
+    late.load_state(tmp_path / "a.safetensors", "x")
+    late.frame(2)
+    first = gi.FrameScheduler(scene, CAMERA, DENOISED)
+    first.frame(2)
+    assert history(late).max() == history(first).max()  # another light: it begins anew
+
+
+def test_cells_that_followed_an_edit_are_no_state_of_a_scene_at_rest(tmp_path):
+    scene = robot()
+    scheduler = gi.FrameScheduler(scene, CAMERA, SMALL)
+    scheduler.frame(0)
+    scene.nodes[1].parent_from_node = moved(-0.45, 0.2)
+    scheduler.frame(1)
+    scheduler.save_state(tmp_path / "a.safetensors", "x")
+    scheduler.load_state(tmp_path / "a.safetensors", "x")  # its own
+    with pytest.raises(BakeError, match=r"this bake has other settings \(bake\.indirect\.ends_in: "):
+        gi.FrameScheduler(fresh(scene), CAMERA, SMALL).load_state(tmp_path / "a.safetensors", "x")
+
+
 def test_cells_know_what_moved_in_the_same_frame_and_past_their_grid():
     scene = robot()
     scheduler = gi.FrameScheduler(scene, CAMERA, SMALL)

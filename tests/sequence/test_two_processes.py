@@ -143,6 +143,45 @@ def test_a_generator_that_is_left_lets_go(tmp_path):
     assert len(list(gi.render(scene, path, gi.Pipeline(spp=1), output=tmp_path / "a.####.exr"))) == 3
 
 
+@pytest.mark.parametrize("kind", ["frame", "state"])
+def test_what_is_left_of_an_ended_run_writes_over_nothing(tmp_path, kind):
+    """A worker that nobody could stop, or a process whose lock another machine could not see."""
+    scene, camera = gi.builtin_scene("cornell_box"), gi.Camera.look_at((0, 1, 3), (0, 1, 0), resolution=(8, 8))
+    path = gi.CameraPath.from_cameras([camera] * 3)
+    where = {"output": tmp_path / "a.####.exr"}
+    denoise = {"frame": None, "state": "spatiotemporal"}[kind]
+    frames = gi.render(scene, path, gi.Pipeline(spp=1, denoise=denoise), seed=1, **where)
+    next(frames)
+    (claim,) = hidden(tmp_path)
+    (tmp_path / claim).unlink()  # as another machine does that takes it for a dead one's
+    list(gi.render(scene, path, gi.Pipeline(spp=1, denoise=denoise), seed=2, **where))
+    newer = {file: file.read_bytes() for file in tmp_path.iterdir()}
+    with pytest.raises(OSError, match="the run that this frame is of has ended, or another one has taken its place"):
+        next(frames)
+    assert {file: file.read_bytes() for file in tmp_path.iterdir()} == newer
+
+
+def test_workers_of_a_cluster_write_under_the_claim_of_who_asked(tmp_path):
+    from warp_gi.cluster.engine import job_of
+    from warp_gi.cluster.job import SceneAsItIs
+    from warp_gi.cluster.worker import _Bench
+    from warp_gi.scheduler import FrameScheduler
+    from warp_gi.sequence.resume import Output, SequenceRun, shots_of
+
+    camera = gi.Camera.look_at((0, 1, 3), (0, 1, 0), resolution=(8, 8))
+    scheduler = FrameScheduler(gi.builtin_scene("cornell_box"), camera, gi.Pipeline(spp=1))
+    output = Output(tmp_path / "a.####.exr")
+    run = SequenceRun(scheduler, shots_of(camera, [0, 1], output.pattern), output)
+    plan = run.plan(False)
+    run.prepare(plan)
+    bench = _Bench(job_of(run, plan, SceneAsItIs(scheduler.scene), (), None, False))
+    assert bench.render(0) and (tmp_path / "a.0000.exr").exists()
+    run.finish()
+    with pytest.raises(OSError, match="has ended"):
+        bench.render(1)
+    assert [file.name for file in tmp_path.iterdir()] == ["a.0000.exr"]
+
+
 def test_previews_follow_the_exposure(tmp_path):
     """Those of kept frames are made again where their exposure is another one, and left alone where it is not."""
     command = ["render", *TINY, "--frames", "0-1", "-o", str(tmp_path / "a.####.exr"), "--preview"]

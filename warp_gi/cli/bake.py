@@ -17,6 +17,7 @@ from warp_gi.cli.inputs import (
     BAKE_SUFFIX,
     DEFAULT_SCENE,
     SceneOptions,
+    check_camera_options,
     find_camera,
     find_scene,
     has_camera,
@@ -171,6 +172,7 @@ def run(options: BakeOptions, report: Reporter) -> None:
         raise OptionError(f"--export-components goes with --export of {names}; leave it out")
     if options.view is not None:
         tool.check_view(options.settings, options.view)
+    check_camera_options(options)
     resolution = parse_resolution(options.picture) if options.picture else None
     files = [output, *(tool.exported_files(options.export) if options.export else ()), *filter(None, [options.view])]
     check_files(options, files)

@@ -19,6 +19,7 @@ from warp_gi.scene.builtin import BUILTIN_SCENES, builtin_camera_path, builtin_s
 from warp_gi.scene.camera import STILL_FPS, Camera, CameraPath
 from warp_gi.scene.environment import Environment, SunSky, as_environment
 from warp_gi.scene.loading import load_scene
+from warp_gi.scene.pinhole import checked_resolution
 from warp_gi.scene.scene import Scene
 from warp_gi.scene.sky_motion import SkySequence, TurningSky
 
@@ -229,7 +230,7 @@ def overview(scene: Scene, hfov: float) -> Camera:
 
 def parse_resolution(text: str) -> tuple[int, int]:
     """Return (width, height) of "960x540"; raises OptionError for anything else."""
-    match = re.fullmatch(r"\s*(\d+)\s*[xX×]\s*(\d+)\s*", text)
+    match = re.fullmatch(r"\s*(\d{1,18})\s*[xX×]\s*(\d{1,18})\s*", text)
     if not match or not int(match[1]) or not int(match[2]):
-        raise OptionError(f"resolution {text!r} not understood; write for example 960x540")
-    return int(match[1]), int(match[2])
+        raise OptionError(f"resolution {text[:80]!r} not understood; write for example 960x540")
+    return checked_resolution((match[1], match[2]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import io
 import os
@@ -131,6 +132,8 @@ def _message(error: BaseException | str) -> str:
         return f"not enough memory {error}".strip()
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename2 or error.filename}: {error.strerror}"  # filename2 is the target of a rename
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:  # all else that is written has a name
+        return f"standard output: {error.strerror}"
     return one_line(error)
 
 

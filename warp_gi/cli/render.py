@@ -37,6 +37,7 @@ from warp_gi.scene.baked import BakedScene
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.scene import Scene
 from warp_gi.scheduler import FrameScheduler
+from warp_gi.sequence.banded import BandedFrame
 from warp_gi.sequence.chunks import chunk_of, run_of
 from warp_gi.sequence.frame_time import parse_seconds, take_time
 from warp_gi.sequence.frames import parse_frames
@@ -98,6 +99,9 @@ class Render(SceneOptions):
     """Number of threads on the CPU. The pictures do not depend on it."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = Path("out/shot.####.exr")
     """Name of the frames' files; #### becomes the frame's number."""
+    memory: Annotated[float | None, flag("GB", "what is free")] = None
+    """Gigabytes that a picture may take. A larger one is rendered in bands of its rows, to the same bits, where the
+    pipeline can: path, direct and cache, without a denoiser."""
     precision: Literal["half", "float"] = "half"
     """Storage of colours and normals in EXR files. Positions, depth, motion, ids and variance are always float."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -179,8 +183,9 @@ def run(options: Render, report: Reporter) -> None:
         move_sky(scene, options.environment_turn, camera, [shot.index for shot in shots])
     shown = scene.bake if isinstance(scene, BakedScene) else scene
     cache = BakeFolder() if options.cache else None
+    memory = None if options.memory is None else 1e9 * options.memory
     scheduler = FrameScheduler(
-        shown, camera, options.settings, options.device, options.seed, report.stage, bakes, cache
+        shown, camera, options.settings, options.device, options.seed, report.stage, bakes, cache, memory
     )
     if options.reuse_pictures is not None:
         from warp_gi.techniques.reuse.pictures import check_pictures  # its kernels are not for every run
@@ -285,7 +290,7 @@ def render_shots(options: Render, plan: Plan, sequence: SequenceRun, report: Rep
             sequence.save_state(shot, frame)
             for stage, seconds in frame.timings.items():
                 times.setdefault(stage, []).append(seconds)
-            if options.reuse_pictures is not None and shot is plan.todo[-1]:
+            if options.reuse_pictures is not None and shot is plan.todo[-1] and isinstance(frame, Frame):
                 from warp_gi.techniques.reuse.pictures import reuse_pictures
 
                 reuse_pictures(sequence.scheduler, frame, options.reuse_pictures, options.reuse_pixel)
@@ -296,7 +301,7 @@ def render_shots(options: Render, plan: Plan, sequence: SequenceRun, report: Rep
     return times
 
 
-def render_shot(shot: Shot, sequence: SequenceRun, report: Reporter) -> tuple[Frame, dict[str, float]]:
+def render_shot(shot: Shot, sequence: SequenceRun, report: Reporter) -> tuple[Frame | BandedFrame, dict[str, float]]:
     """Render a frame and write it; return it, and the seconds of its stages."""
     started, compiled = time.perf_counter(), launch.compile_seconds
     frame = sequence.render(shot)

@@ -100,6 +100,8 @@ def job_of(
         about=tuple(sorted(scheduler.metadata(run.shots[0].time).items())),
         depends=bool(plan.dependence.on_past),
         since=0 if resume else now,
+        memory=scheduler.memory,
+        permit=run.permit,
     )
 
 

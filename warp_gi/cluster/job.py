@@ -69,6 +69,10 @@ class Job:
     """Whether frames depend on those before."""
     since: int
     """Time in ns, by the clock of the disk, from which on a file is one of this job; 0 takes older ones, too."""
+    memory: float | None = None
+    """Bytes that a picture may take on a worker; None is what it has free."""
+    permit: Path | None = None
+    """File of the claim of whoever asked, which is gone when that run has ended: then workers write nothing more."""
 
     def begin(self) -> SequenceRun:
         """Return what renders the sequence in this process.
@@ -77,9 +81,10 @@ class Job:
         """
         bakes = [load_bake(one) if isinstance(one, Path) else one for one in self.bakes]
         scene = self.scene.open()
-        scheduler = FrameScheduler(scene, self.camera, self.pipeline, self.device, self.seed, None, bakes, self.cache)
+        of_scene = scene, self.camera, self.pipeline, self.device, self.seed
+        scheduler = FrameScheduler(*of_scene, None, bakes, self.cache, self.memory)
         run = SequenceRun(scheduler, shots_of(scheduler.camera, self.frames, self.output.pattern), self.output)
-        run.since = self.since
+        run.since, run.permit = self.since, self.permit
         run.bake()
         mine, wanted = scheduler.metadata(run.shots[0].time), dict(self.about)
         for name in sorted({*mine, *wanted}):

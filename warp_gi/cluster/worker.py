@@ -77,7 +77,7 @@ class _Bench:
         if self.live is not None and place and self.live[0] == self.run.shots[place - 1].lineage:
             return self.live[1]
         part = PartRun(copy.copy(self.run.scheduler), self.run.shots, self.job.output, range(place, place + 1))
-        part.since = self.job.since
+        part.since, part.permit = self.job.since, self.job.permit
         part.plan()
         return part
 

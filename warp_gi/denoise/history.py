@@ -12,7 +12,7 @@ import warp as wp
 from warp_gi import launch
 from warp_gi.kernels import denoise
 from warp_gi.layout import Layout, misfit
-from warp_gi.scene.hashing import light_of
+from warp_gi.scene.hashing import light_now, light_of
 
 if TYPE_CHECKING:
     from warp_gi.frame import Frame
@@ -65,7 +65,7 @@ class History:
         parts |= {} if self.apart is None else {"apart": self.apart.average}
         frame = {
             "frame": np.array([self.index, *self.resolution]),
-            "light": np.frombuffer(self.scene[1].encode(), np.uint8),
+            "light": np.frombuffer(self._light().encode(), np.uint8),
         }
         if self.apart is not None:
             frame["apart_directions"] = self.apart.directions
@@ -85,7 +85,14 @@ class History:
             lights = _loaded(arrays["apart"], wp.vec4, size[0] * size[1], device)
             apart = ApartHistory(lights, arrays["apart_directions"].reshape(-1, 3))
         light = arrays["light"].tobytes().decode("ascii")
+        if light == light_now(self.scene[0]):
+            light = light_of(self.scene[0])
         return History(index, (size[0], size[1]), (self.scene[0], light), guides, average, apart, picture)
+
+    def _light(self) -> str:
+        """Return the hash of the light for other processes, in which nothing is known of edits before."""
+        scene, known = self.scene
+        return light_now(scene) if known == light_of(scene) else known
 
     def fault(self, before: History, states: Mapping[str, Any]) -> str:
         """Return why a state that was read from a file cannot be; "" if it can."""

@@ -25,7 +25,7 @@ class BakedScene:
     Raises BakeError for a bake that does not say where its scene was.
     """
 
-    version = 0
+    version = moved = 0
     environment = None
     is_animated = False
     is_sky_animated = False

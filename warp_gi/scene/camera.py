@@ -19,7 +19,7 @@ from warp_gi.errors import OptionError, SceneError, check_number, unknown_name
 from warp_gi.files import user_path
 from warp_gi.scene.animation import key_times
 from warp_gi.scene.camera_files import naming_file, read_camera_file
-from warp_gi.scene.pinhole import Camera
+from warp_gi.scene.pinhole import Camera, checked_resolution
 
 if TYPE_CHECKING:
     from warp_gi.scene.scene import Scene
@@ -32,6 +32,8 @@ MOST_BETWEEN, CLOSE = 240, 4
 """Keys of a path between two keyframes of a scene, and frames beside each of these that have a key in any case."""
 COARSE = 2e-3
 """Largest step of float32 positions at a camera, in radii of the scene, that goes without a warning."""
+LAST_FRAME = 2**31 - 1
+"""Largest number of a frame, as files hold it."""
 STILL_FPS = 24.0
 """Frames per second of a camera that is no path."""
 
@@ -141,6 +143,7 @@ class CameraPath:
 
     def at_resolution(self, width: int, height: int) -> CameraPath:
         """Return the same path with another resolution; fields of view stay as ``CameraKey.keeps_vertical`` says."""
+        width, height = checked_resolution((width, height))
         wider = (width / height) / (self.resolution[0] / self.resolution[1])
 
         def fitted(key: CameraKey) -> CameraKey:
@@ -307,7 +310,12 @@ def warn_if_far(camera: Camera | CameraPath, scene: Scene) -> None:
 
 
 def frame_time(camera: Camera | CameraPath, index: int) -> float:
-    """Return the time of a frame in seconds: that of the path, or of ``STILL_FPS`` frames a second."""
+    """Return the time of a frame in seconds: that of the path, or of ``STILL_FPS`` frames a second.
+
+    Raises OptionError for a number past ``LAST_FRAME``.
+    """
+    if index > LAST_FRAME:
+        raise OptionError(f"frame numbers must be at most {LAST_FRAME:,}, got {str(index)[:15]}...")
     return index / (camera.fps if isinstance(camera, CameraPath) else STILL_FPS)
 
 

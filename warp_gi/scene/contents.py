@@ -31,6 +31,8 @@ class SceneContents(Protocol):
     name: str
     version: int
     """Number of changes so far."""
+    moved: int
+    """Number of edits so far of the way that nodes move, which every frame reads anew."""
     nodes: list[Node]
     lights: list[PunctualLight]
     materials: list[Material]

@@ -45,22 +45,12 @@ class Edit(NamedTuple):
     """What it changes, if pictures can follow: "shape", "materials", "emission", "lights" or "sky"."""
 
 
-class _Slot(NamedTuple):
-    """The place of a node's mesh in the flat geometry."""
-
-    mesh: Mesh
-    vertices: slice
-    triangles: slice
-    row: int
-    """Index of the mesh's material in ``Scene.materials``."""
-
-
 class Edits:
     """The objects that a scene was made from. Made anew whenever the scene reads its nodes again."""
 
     def __init__(self, scene: SceneContents) -> None:
         self.scene = scene
-        self.slots = _slots(scene)
+        self.slots = watched.slots_of(scene)
         self.material_count = len(scene.materials)
         self.pending: set[str] = set()
         """What is to be followed; an interrupt may leave it half done."""
@@ -68,6 +58,8 @@ class Edits:
         self.edited_textures: list[Texture] = []
         self.has_other_images = False
         self.lets_rays_pass = False
+        self.are_keyframes_others = False
+        """Whether nodes that move take another way since they were last taken over."""
         self.watches: dict[str, Watch] = {}
         self.lights: bytes | None = None
         self.sky_watch: Watch | None = None
@@ -123,6 +115,10 @@ class Edits:
                     f"and pictures would not show it; {edit.cure}"
                 )
         self.pending |= {edit.follow for edit in found}
+        if self.are_keyframes_others:
+            self.scene._digests.forget("motion")
+            self.scene.moved += 1
+            self.are_keyframes_others = False
         if self.pending:
             self._follow()
         if changes:
@@ -198,7 +194,10 @@ class Edits:
             parent = nodes[place].parent
             if parent in under:
                 under.add(place)
-            if place not in under or scene._moving[place]:
+            if place not in under:
+                continue
+            if scene._moving[place]:  # read for every frame; only hashes have to know
+                self.are_keyframes_others = True
                 continue
             stands = bool(self.slots[place]) and nodes[place].skin is None
             if moving[place] and (stands or place in carries):
@@ -244,13 +243,13 @@ class Edits:
         edits = (self._slot_edit(mesh, slot, index) for index, candidate, slot in self._meshes() if candidate is mesh)
         return _worst(edit for edit in edits if edit)
 
-    def _meshes(self) -> Iterator[tuple[int, Mesh, _Slot]]:
+    def _meshes(self) -> Iterator[tuple[int, Mesh, watched.Slot]]:
         """Yield the meshes that the nodes have now, with the index of the node and the place of the copy."""
         for index, (node, slots) in enumerate(zip(self.scene.nodes, self.slots, strict=False)):
             for mesh, slot in zip(node.meshes, slots, strict=False):
                 yield index, mesh, slot
 
-    def _slot_edit(self, mesh: Mesh, slot: _Slot, index: int) -> Edit | None:
+    def _slot_edit(self, mesh: Mesh, slot: watched.Slot, index: int) -> Edit | None:
         """Return whether a mesh differs from a copy."""
         node = self.scene.nodes[index]
         geometry.check_mesh(mesh, f"mesh {mesh.name!r} of node {node.name!r}")
@@ -368,21 +367,6 @@ class Edits:
             ):
                 return Edit(f"{field} of the environment changed", NEW_SKY, follow)
         return None
-
-
-def _slots(scene: SceneContents) -> list[list[_Slot]]:
-    """Return for each node where its meshes lie in the flat geometry."""
-    rows = {id(material): row for row, material in enumerate(scene.materials)}
-    vertex = triangle = 0
-    slots: list[list[_Slot]] = []
-    for node in scene.nodes:
-        slots.append([])
-        for mesh in node.meshes:
-            vertices = slice(vertex, vertex + len(mesh.points))
-            triangles = slice(triangle, triangle + len(mesh.indices))
-            slots[-1].append(_Slot(mesh, vertices, triangles, rows[id(mesh.material)]))
-            vertex, triangle = vertices.stop, triangles.stop
-    return slots
 
 
 def _index(items: Iterable[object], wanted: object) -> int | None:

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from warp_gi.scene.model import Node, Texture
 
 
-def geometry_hash(scene: SceneContents) -> str:
-    """Return the SHA-256 of all that decides visibility: triangles, alpha masks, animation."""
+def geometry_digest(scene: SceneContents) -> hashlib._Hash:
+    """Return a SHA-256 of what decides visibility at time 0, for ``with_motion``: triangles and alpha masks."""
     digest = hashlib.sha256(b"warp_gi geometry 1")
     flat = scene._flat
     masked = np.array([m.lets_rays_pass for m in scene.materials])
@@ -39,14 +39,23 @@ def geometry_hash(scene: SceneContents) -> str:
             _update(digest, flat.further_uvs[flat.indices[second]])
         for material in (m for m in scene.materials if m.lets_rays_pass):
             _update(digest, *textures.visibility_parts(material))
+    return digest
+
+
+def with_motion(still: hashlib._Hash, scene: SceneContents) -> str:
+    """Return the SHA-256 of all that decides visibility: of ``geometry_digest``, and animation as nodes have it."""
+    digest = still.copy()
+    world = animation.world_matrices(scene.nodes, 0.0) if any(scene._moving) else []
     for index, node in enumerate(scene.nodes):
         if scene._moving[index]:
             keys = [asdict(key) for key in node.keyframes or ()]
-            start, stop = flat.vertex_starts[index : index + 2]
+            start, stop = scene._flat.vertex_starts[index : index + 2]
             _update(digest, repr((start, stop, node.parent, keys)), np.asarray(node.parent_from_node))
             if deforms(node):
                 digest.update(shape_hash(node).encode())
                 _update(digest, scene._poses[index].key)
+            if not np.array_equal(world[index], scene._poses[index].matrix):  # edited: the triangles are where it was
+                _update(digest, world[index])
     return digest.hexdigest()
 
 
@@ -75,13 +84,17 @@ class Digests:
     def __init__(self, scene: SceneContents) -> None:
         self._scene = scene
         self._known: dict[str, str] = {}
+        self._still: hashlib._Hash | None = None
         self._light: str | None = None
 
     def forget(self, *names: str) -> None:
         """Compute some anew when they are asked for: "geometry", "normals", "surfaces", "images", "light".
 
-        That of all contents is computed anew too.
+        "motion" is that of the geometry as far as keyframes decide it. That of all contents is computed anew too.
         """
+        if "geometry" in names:
+            self._still = None
+        names = tuple("geometry" if name == "motion" else name for name in names)
         for name in (*names, "contents"):
             self._known.pop(name, None)
         if "light" in names:
@@ -89,7 +102,7 @@ class Digests:
 
     def geometry(self) -> str:
         """Return the hash of all that decides visibility."""
-        return self._once("geometry", lambda: geometry_hash(self._scene))
+        return self._once("geometry", self._geometry)
 
     def contents(self) -> str:
         """Return the hash of all that decides the pictures, except cameras and sky."""
@@ -111,6 +124,12 @@ class Digests:
         if self._scene._devices:
             self._known[name] = found
         return found
+
+    def _geometry(self) -> str:
+        still = self._still or geometry_digest(self._scene)
+        if self._scene._devices:
+            self._still = still
+        return with_motion(still, self._scene)
 
     def _contents(self) -> str:
         scene, flat = self._scene, self._scene._flat
@@ -149,6 +168,11 @@ class Lit(Protocol):
         ...
 
     @property
+    def contents_hash(self) -> str:
+        """Hash of all but the sky."""
+        ...
+
+    @property
     def environment(self) -> Environment | None:
         """The present sky."""
         ...
@@ -165,6 +189,11 @@ def light_of(scene: Lit) -> str:
     Nodes and points that edits move are left out, as those that keyframes move: what is kept over frames follows them.
     """
     return scene.light_hash if scene.is_sky_animated else with_sky(scene.light_hash, scene.environment)
+
+
+def light_now(scene: Lit) -> str:
+    """Return what ``light_of`` is in a process that makes the scene as it is now, all edits in it."""
+    return scene.contents_hash if scene.is_sky_animated else with_sky(scene.contents_hash, scene.environment)
 
 
 def with_sky(contents: str, sky: Environment | None) -> str:

@@ -104,17 +104,7 @@ class Camera:
             check_number(f"camera {self.name!r}: lens_shift", shift)
         if not all(math.isfinite(shift) for shift in self.lens_shift):
             raise OptionError(f"camera {self.name!r}: lens_shift must be two finite numbers, got {self.lens_shift}")
-        try:
-            width, height = (int(size) for size in self.resolution)
-        except (TypeError, ValueError) as error:
-            raise OptionError(f"resolution must be (width, height), got {self.resolution!r}") from error
-        if width < 1 or height < 1:
-            raise OptionError(f"resolution must be at least 1x1, got {width}x{height}")
-        if max(width, height) > LARGEST_SIDE or width * height > LARGEST_COUNT:
-            raise OptionError(
-                f"resolution must be at most {LARGEST_SIDE} a side and {LARGEST_COUNT:,} pixels, got {width}x{height}"
-            )
-        object.__setattr__(self, "resolution", (width, height))
+        object.__setattr__(self, "resolution", checked_resolution(self.resolution))
 
     def __eq__(self, other: object) -> bool:
         """Return whether another camera makes the same pictures, whatever its name."""
@@ -235,6 +225,7 @@ class Camera:
 
     def at_resolution(self, width: int, height: int) -> Camera:
         """Return the same camera with another resolution; see ``keeps_vertical`` for another shape."""
+        width, height = checked_resolution((width, height))
         camera = replace(self, resolution=(width, height))
         is_alike = width * self.resolution[1] == height * self.resolution[0]
         is_kept = is_alike or not self.keeps_vertical or self.is_orthographic
@@ -312,6 +303,20 @@ class Camera:
         (fx, _, cx), (_, fy, cy), _ = self.intrinsics
         depth = np.ones((len(local), 1)) if self.is_orthographic else -local[:, 2:]
         return local[:, :2] / depth * [fx, -fy] + np.array([cx, cy])
+
+
+def checked_resolution(resolution: object) -> tuple[int, int]:
+    """Return width and height in pixels; raises OptionError for what is no resolution, and for too many pixels."""
+    try:
+        width, height = (int(size) for size in resolution)  # type: ignore[attr-defined]
+    except (TypeError, ValueError, OverflowError) as error:
+        raise OptionError(f"resolution must be (width, height), got {resolution!r:.80}") from error
+    if width < 1 or height < 1:
+        raise OptionError(f"resolution must be at least 1x1, got {width:.6g}x{height:.6g}")
+    if max(width, height) > LARGEST_SIDE or width * height > LARGEST_COUNT:
+        sizes = "x".join(f"{str(size)[:9]}{'...' * (size >= 10**9)}" for size in (width, height))
+        raise OptionError(f"resolution must be at most {LARGEST_SIDE} a side and {LARGEST_COUNT:,} pixels, got {sizes}")
+    return width, height
 
 
 def check_last_row(matrix: np.ndarray, name: str) -> None:

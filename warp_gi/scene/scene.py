@@ -59,7 +59,7 @@ class Scene:
         self.name = name
         self.offset = np.zeros(3)
         """What was taken from all positions of a file, float64 [3] in metres; see ``load_scene``'s ``recentre``."""
-        self.version = 0
+        self.version = self.moved = 0
         """Number of changes of environment and animation so far. After another one, what was derived from the
         scene is stale."""
         self.nodes: list[Node] = [replace(node) for node in nodes]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -16,6 +16,17 @@ from warp_gi.scene.watching import Change, Owner
 
 if TYPE_CHECKING:
     from warp_gi.scene.contents import SceneContents
+
+
+class Slot(NamedTuple):
+    """The place of a node's mesh in the flat geometry."""
+
+    mesh: Mesh
+    vertices: slice
+    triangles: slice
+    row: int
+    """Index of the mesh's material in ``Scene.materials``."""
+
 
 Item = TypeVar("Item", Material, Mesh, Node, PunctualLight)
 
@@ -78,6 +89,21 @@ def emissions(materials: Sequence[Material]) -> list[list[float]]:
         if any(values[:-2]) and material.emission_texture is not None:
             values.append(float(zlib.adler32(np.ascontiguousarray(material.emission_texture.pixels).data)))
     return found
+
+
+def slots_of(scene: SceneContents) -> list[list[Slot]]:
+    """Return for each node where its meshes lie in the flat geometry."""
+    rows = {id(material): row for row, material in enumerate(scene.materials)}
+    vertex = triangle = 0
+    slots: list[list[Slot]] = []
+    for node in scene.nodes:
+        slots.append([])
+        for mesh in node.meshes:
+            vertices = slice(vertex, vertex + len(mesh.points))
+            triangles = slice(triangle, triangle + len(mesh.indices))
+            slots[-1].append(Slot(mesh, vertices, triangles, rows[id(mesh.material)]))
+            vertex, triangle = vertices.stop, triangles.stop
+    return slots
 
 
 def missing(items: Iterable[Item], others: Iterable[object]) -> list[Item]:

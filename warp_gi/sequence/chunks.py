@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_gi.errors import OptionError, whole_number
+from warp_gi.sequence.banded import BandedFrame
 from warp_gi.sequence.resume import Output, Plan, SequenceRun, Shot, why_restart
 
 if TYPE_CHECKING:
@@ -163,7 +164,7 @@ class PartRun(SequenceRun):
             self.scheduler.frame(shot.index, shot.previous)
         self._before = []
 
-    def render(self, shot: Shot) -> Frame:
+    def render(self, shot: Shot) -> Frame | BandedFrame:
         """Render a frame of the plan's ``todo`` and write its file; see ``SequenceRun.render``."""
         self.lead()
         return super().render(shot)

@@ -24,6 +24,8 @@ from warp_gi.memory import check_memory
 from warp_gi.openimageio import native_name, open_image, reason
 
 HALF_MAX = 65504.0
+SEEN = 1 << 24
+"""Values that are read at once from a file that is looked through."""
 
 _writing = threading.Lock()  # OpenEXR's number of threads is one for all files; taken across a fork
 
@@ -136,22 +138,23 @@ def write_exr(
             OpenEXR.set_global_thread_count(0)  # a forked process would wait for threads that only its parent has
 
 
-def read_exr(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Attribute], dict[str, str]]:
+def read_exr(path: str | Path, keep: bool = True) -> tuple[dict[str, np.ndarray], dict[str, Attribute], dict[str, str]]:
     """Read an EXR file (or HDR): its buffers by name, its attributes, and the format ("half", "float") of each buffer.
 
     Buffers are float32 [height, width] or [height, width, channels], identifiers int32; a
     file by another program gives its layers by the same rules. Matrices come back as float32
-    [4, 4] or [3, 3], pairs as [2]. Raises SceneError when the file is missing, torn or not an EXR.
+    [4, 4] or [3, 3], pairs as [2]. Without ``keep`` all pixels are read some rows at a time, to see that they are
+    there, and buffers are zeros that take no memory. Raises SceneError when the file is missing, torn or not an EXR.
     """
     if not Path(path).is_file():
         raise SceneError(f"{path}: no such file")
     try:
-        return _read(Path(path))
+        return _read(Path(path), keep)
     except UnicodeDecodeError as error:  # names or texts of its header
         raise SceneError(f"{path}: not a whole EXR file (its header holds text that is not UTF-8)") from error
 
 
-def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Attribute], dict[str, str]]:
+def _read(path: Path, keep: bool) -> tuple[dict[str, np.ndarray], dict[str, Attribute], dict[str, str]]:
     kind, source = path.suffix[1:].upper() or "EXR", open_image(path)
     if source is None:
         raise SceneError(f"{path}: not a whole {kind} file ({reason()})")
@@ -159,8 +162,11 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Attribute], dict
         spec = source.spec()
         if spec.deep:  # what OpenImageIO would return are no pixels, but what lay in memory
             raise SceneError(f"{path}: deep EXR, which has no one value a pixel; flatten it first")
-        check_memory(f"{path}: {spec.width}x{spec.height} pixels", 8 * spec.image_pixels() * spec.nchannels)
-        pixels = source.read_image("float")
+        if keep or spec.tile_width:
+            check_memory(f"{path}: {spec.width}x{spec.height} pixels", 8 * spec.image_pixels() * spec.nchannels)
+            pixels = source.read_image("float")
+        else:
+            pixels = _seen(source, spec)
         problem = reason(source, "")  # missing scan lines are reported here, with zeros in the pixels
     finally:
         source.close()
@@ -176,7 +182,12 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Attribute], dict
             {name: rank for rank, name in enumerate(channel_names(buffer, len(indices)))} if len(indices) < 5 else {}
         )
         indices.sort(key=lambda i: order.get(spec.channelnames[i], i))
-        values = np.ascontiguousarray(pixels[:, :, indices] if len(indices) > 1 else pixels[:, :, indices[0]])
+        values = pixels[:, :, indices[0]]
+        if not keep:
+            shape = values.shape + (len(indices),) * (len(indices) > 1)
+            buffers[buffer] = np.broadcast_to(np.float32(0), shape)
+            continue
+        values = np.ascontiguousarray(pixels[:, :, indices] if len(indices) > 1 else values)
         buffers[buffer] = values.astype(np.int32) if buffer in _INTEGER else values
     attributes: dict[str, Attribute] = {}
     for item in spec.extra_attribs:
@@ -185,6 +196,16 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Attribute], dict
         value = value if shape is None else np.array(value, np.float32).reshape(shape)
         attributes[_OIIO_NAMES.get(item.name, item.name)] = value
     return buffers, attributes, {buffer: formats[indices[0]] for buffer, indices in groups.items()}
+
+
+def _seen(source: Any, spec: Any) -> np.ndarray | None:
+    """Read all rows of a file, some at a time; return zeros in place of its pixels, or None if some are missing."""
+    step = max(SEEN // max(spec.width * spec.nchannels, 1), 1)
+    for start in range(spec.y, spec.y + spec.height, step):
+        stop = min(start + step, spec.y + spec.height)
+        if source.read_scanlines(start, stop, 0, 0, spec.nchannels, "float") is None:
+            return None
+    return np.broadcast_to(np.float32(0), (spec.height, spec.width, spec.nchannels))
 
 
 def _buffer_of(channel: str) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 
 from warp_gi.errors import GiError, OptionError, SceneError, one_line
 from warp_gi.files import frame_path, replacing, user_path
-from warp_gi.scene.camera import Camera
+from warp_gi.scene.camera import LAST_FRAME, Camera
 from warp_gi.scene.pinhole import offset_text
 from warp_gi.sequence.exr import Attribute, plain, read_exr, stored_values, write_exr
 from warp_gi.sequence.preview import picture_bytes, tone_map, write_png
@@ -117,11 +117,13 @@ def parse_frames(text: str) -> list[int]:
     """Return the frame numbers of "5", "0-47", "0-47:2" or a comma-separated list of these, in order, each once."""
     frames: dict[int, None] = {}
     for part in text.split(","):
-        match = re.fullmatch(r"\s*(\d+)(?:-(\d+)(?::(\d+))?)?\s*", part)
+        match = re.fullmatch(r"\s*(\d{1,18})(?:-(\d{1,18})(?::(\d{1,18}))?)?\s*", part)
         first, last, step = match.groups() if match else ("1", "0", None)
         span = range(int(first), int(last or first) + 1, max(int(step or 1), 1))
         if not span or (step is not None and int(step) == 0):
-            raise OptionError(f"frames {text!r} not understood; write for example 5, 0-47, 0-47:2 or 1,4,9-12")
+            raise OptionError(f"frames {text[:80]!r} not understood; write for example 5, 0-47, 0-47:2 or 1,4,9-12")
+        if span[-1] > LAST_FRAME:
+            raise OptionError(f"frames {text[:80]!r}: numbers must be at most {LAST_FRAME:,}")
         if len(span) + len(frames) > MOST_FRAMES:
             raise OptionError(f"frames {text!r} are more than {MOST_FRAMES:,}; render them in parts")
         frames.update(dict.fromkeys(span))
@@ -197,10 +199,7 @@ def write_frame(frame: FrameLike, pattern: str | Path, precision: str = "half") 
         return write_preview(frame, path)
     if path.suffix.lower() != ".exr":
         raise OptionError(f"cannot write {path.name}: frames are .exr or .png files")
-    previous = getattr(frame, "previous_camera", None)
-    attributes = frame_attributes(frame.index, frame.time, frame.camera, frame.metadata, previous, precision)
-    attributes |= {TIMES + stage: float(seconds) for stage, seconds in frame.timings.items()}
-    attributes |= {MEASURED + name: float(value) for name, value in getattr(frame, "measured", {}).items()}
+    attributes = written_attributes(frame, precision)
     buffers = {name: frame.numpy(name) for name in frame.names}
     with replacing(path) as part:
         try:
@@ -208,6 +207,14 @@ def write_frame(frame: FrameLike, pattern: str | Path, precision: str = "half") 
         except OSError as error:
             raise OSError(str(error).replace(str(part), str(path))) from error
     return path
+
+
+def written_attributes(frame: FrameLike, precision: str) -> dict[str, Attribute]:
+    """Return all EXR attributes of a frame, its stage times and what it measured among them."""
+    previous = getattr(frame, "previous_camera", None)
+    attributes = frame_attributes(frame.index, frame.time, frame.camera, frame.metadata, previous, precision)
+    attributes |= {TIMES + stage: float(seconds) for stage, seconds in frame.timings.items()}
+    return attributes | {MEASURED + name: float(value) for name, value in getattr(frame, "measured", {}).items()}
 
 
 class HasBuffers(Protocol):
@@ -226,8 +233,13 @@ def write_preview(frame: HasBuffers, path: str | Path, exposure: float = 0.0) ->
 
 def read_frame(path: str | Path) -> FrameFile:
     """Read a frame's buffers and metadata back; raises SceneError when the file is missing or not whole."""
+    return _frame_in(path, True)
+
+
+def _frame_in(path: str | Path, keep: bool) -> FrameFile:
+    """Return a frame's file; without ``keep`` it is read to its end, and buffers are zeros."""
     try:
-        return _frame_file(*read_exr(user_path(path)))
+        return _frame_file(*read_exr(user_path(path), keep))
     except GiError:
         raise
     except (ValueError, TypeError, KeyError, IndexError, OverflowError, np.linalg.LinAlgError) as error:
@@ -272,7 +284,7 @@ def why_not_whole(
     gives the resolution.
     """
     try:
-        frame = read_frame(path)
+        frame = _frame_in(path, False)
     except GiError:
         return "missing" if not Path(path).is_file() else "not whole"
     size = next(iter(frame.buffers.values())).shape[1::-1]

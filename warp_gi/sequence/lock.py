@@ -1,7 +1,9 @@
 """A claim on files of a sequence, so that no other process writes the same ones.
 
 Each process that writes has a small file beside the frames, locked (flock) as long as it lives: the system lets go of
-it however the process ends, in a container too. What nobody holds is removed by the next one.
+it however the process ends, in a container too. What nobody holds is removed by the next one. A file without which no
+frame gets its name: so workers of a cluster whose run has ended write nothing over the frames of the next one, nor does
+a process whose lock another machine could not see.
 """
 
 from __future__ import annotations
@@ -58,6 +60,11 @@ class Claim:
     def path(self) -> Path:
         """The file of the claim."""
         return self.pattern.with_name(f"{self._prefix}{self._about['name']}.lock")
+
+    @property
+    def is_taken(self) -> bool:
+        """Whether the claim is there for others to see; not so on disks without locks."""
+        return self._file is not None
 
     @property
     def _prefix(self) -> str:

@@ -23,8 +23,9 @@ from typing import TYPE_CHECKING, Literal
 
 from warp_gi.baking import settings_in
 from warp_gi.errors import BakeError, OptionError, unknown_name
-from warp_gi.files import check_target, check_writable, frame_path, remove_stale_parts, user_path
+from warp_gi.files import check_target, check_writable, frame_path, remove_stale_parts, user_path, writing_under
 from warp_gi.scene.camera import Camera, CameraPath, frame_time
+from warp_gi.sequence.banded import BandedFrame, render_in_bands
 from warp_gi.sequence.exr import Attribute
 from warp_gi.sequence.frames import (
     frame_attributes,
@@ -198,10 +199,16 @@ class SequenceRun:
         self._claim: Claim | None = None
         self.since = 0
         """Time in ns, by the clock of the disk, from which on files are kept by a resumed run; 0 is any time."""
+        self.permit: Path | None = None
+        """File of the claim on what is written (``Claim.path``): without it no file appears. None asks for none."""
 
     def bake(self) -> None:
-        """Bake under the sky of the sequence's first frame, so that a resumed sequence has the same bake."""
+        """Bake under the sky of the sequence's first frame, so that a resumed sequence has the same bake.
+
+        Edits are taken over first: raises SceneError for one that cannot be followed.
+        """
         with self.scheduler.scene.lock:
+            self.scheduler.scene.check_unchanged()
             self.scheduler.bake(self.shots[0].time, len(self.shots))
 
     @cached_property
@@ -269,6 +276,7 @@ class SequenceRun:
             has_state = plan.dependence.is_saved and self.output.is_exr and not self.output.part
             self._claim = Claim(self.output.pattern, plan.frames, has_state)
             self._claim.take()
+            self.permit = self._claim.path.absolute() if self._claim.is_taken else None
             remove_stale_parts(self.output.state_path)
         for shot in plan.todo:
             check_target(shot.path)
@@ -300,27 +308,36 @@ class SequenceRun:
             return "of an earlier run"
         return found
 
-    def render(self, shot: Shot) -> Frame:
-        """Render a frame of the plan's ``todo`` and write its file; the time it took is the frame's timing "write"."""
+    def render(self, shot: Shot) -> Frame | BandedFrame:
+        """Render a frame of the plan's ``todo`` and write its file; the time it took is the frame's timing "write".
+
+        A picture that is larger than it may is rendered in bands, and what is returned reads its file.
+        """
+        remove_stale_parts(shot.path)
+        if self.scheduler.rows < shot.camera.resolution[1]:
+            with writing_under(self.permit):
+                where = shot.index, shot.previous, shot.path
+                return render_in_bands(self.scheduler, *where, self.output, self._origin(shot))
         frame = self._rendered(shot)
         frame.metadata |= self._origin(shot)
         started = time.perf_counter()
-        remove_stale_parts(shot.path)
-        self.output.write(frame, shot.path)
+        with writing_under(self.permit):
+            self.output.write(frame, shot.path)
         frame.timings["write"] = time.perf_counter() - started
         return frame
 
     def _rendered(self, shot: Shot) -> Frame:
         return self.scheduler.frame(shot.index, shot.previous)
 
-    def save_state(self, shot: Shot, frame: Frame) -> None:
+    def save_state(self, shot: Shot, frame: Frame | BandedFrame) -> None:
         """Save the state after a frame, if later frames depend on it and a file can hold it all.
 
         Seconds are added to the frame's timings as "save state".
         """
         if self.dependence.is_saved and self.output.is_exr:  # nothing resumes from other files
             started = time.perf_counter()
-            self.scheduler.save_state(self.output.state_path, shot.lineage)
+            with writing_under(self.permit):
+                self.scheduler.save_state(self.output.state_path, shot.lineage)
             frame.timings["save state"] = time.perf_counter() - started
 
     def _attributes(self, shot: Shot) -> dict[str, Attribute]:

@@ -37,6 +37,7 @@ class LightHierarchy(Estimator):
     sampled as by ``PowerLights``: there is nothing to choose, and that takes less time. So are more than two million.
     """
 
+    is_per_pixel = True
     term: ClassVar[str] = "emitters"
 
     def samplers(self, scene: Scene | BakedScene | None = None) -> tuple[Any, ...]:

@@ -30,6 +30,7 @@ class TracedEnvironment(Estimator):
     A constant sky is sampled by the BSDF alone. Unbiased.
     """
 
+    is_per_pixel = True
     term: ClassVar[str] = "environment"
 
     def trace(self, frame: Frame, state: None) -> None:
@@ -41,6 +42,7 @@ class TracedEnvironment(Estimator):
 class _TableLights(Estimator):
     """Base of direct light from emitters picked by a table that stays the same over a sequence. Unbiased."""
 
+    is_per_pixel = True
     term: ClassVar[str] = "emitters"
 
     def weights(self, scene: Scene) -> np.ndarray:
@@ -102,6 +104,7 @@ class BsdfPaths(Estimator):
     Unbiased but for ``max_depth`` and ``clamp``.
     """
 
+    is_per_pixel = True
     term: ClassVar[str] = "indirect"
 
     max_depth: int = 64

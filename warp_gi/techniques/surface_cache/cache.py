@@ -51,6 +51,8 @@ class SurfaceCache(RadianceCache):
     nothing is known a path goes on. Biased: light is averaged over a cell. It is for scenes in which nothing moves.
     """
 
+    is_per_pixel = True
+
     paths: int = 150_000
     """Number of paths that fill the cells, from pixels of all frames of the camera's path, at least 1000. More paths
     lower the error that more samples a pixel do not; too few leave pictures dark."""

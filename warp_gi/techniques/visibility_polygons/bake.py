@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_gi import launch
 from warp_gi.baking import Bake
-from warp_gi.errors import BakeError, SceneError
+from warp_gi.errors import SceneError
 from warp_gi.kernels import types
 from warp_gi.kernels import visibility_polygons as kernels
 from warp_gi.kernels import visibility_polygons_audit as audit_kernels
@@ -22,10 +22,10 @@ from warp_gi.kernels import visibility_polygons_bake as contour_kernels
 from warp_gi.kernels import visibility_polygons_match as match_kernels
 from warp_gi.launch import get_device, on_device
 from warp_gi.scene.scene import Scene
+from warp_gi.techniques.visibility_polygons.arrays import TECHNIQUE, check_arrays
 from warp_gi.techniques.visibility_polygons.settings import PolygonSettings
 from warp_gi.techniques.visibility_polygons.vertices import CornerSets, corner_sets
 
-TECHNIQUE = "VisibilityPolygons"
 Progress = Callable[[float], None]
 """Called with the share of the work that is done."""
 OFFSET = 1e-4
@@ -304,8 +304,7 @@ def audit(
 
 
 def contours_of(bake: Bake) -> Contours:
-    """Return the contours that a bake keeps; raises BakeError for another technique's."""
-    if bake.technique != TECHNIQUE:
-        raise BakeError(f"this bake is by {bake.technique!r}, not by {TECHNIQUE!r}: name its own file or bake it again")
+    """Return the contours that a bake keeps; raises BakeError for another technique's, and a damaged one."""
+    check_arrays(bake)
     arrays = bake.arrays
     return Contours(arrays["contour_starts"], arrays["point_starts"], arrays["points"], arrays["set_states"])

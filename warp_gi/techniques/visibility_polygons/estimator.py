@@ -20,6 +20,7 @@ from warp_gi.kernels import visibility_polygons_trace as trace_kernels
 from warp_gi.kernels import visibility_polygons_unbiased as unbiased_kernels
 from warp_gi.launch import get_device
 from warp_gi.scene.baked import whole_scene
+from warp_gi.techniques.visibility_polygons.arrays import check_arrays
 from warp_gi.techniques.visibility_polygons.bake import (
     bake_polygons,
     check_rests,
@@ -140,6 +141,7 @@ class VisibilityPolygons(Estimator):
         bake = bake or self.bake(scene, device, seed)
         known = _states.setdefault(bake, {})
         if device not in known:
+            check_arrays(bake, scene.triangle_count)
             target, arrays = get_device(device), bake.arrays
             sets = sets_on(arrays["positions"], arrays["normals"], contours_of(bake), target)
             known[device] = PolygonState(sets, lists_on(arrays, target))
