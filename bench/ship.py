@@ -16,6 +16,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import warp as wp
 
@@ -45,7 +46,8 @@ def shipped_modules() -> list[str]:
 def place(name: str, folder: Path) -> Path:
     """Return where a module of the present source belongs in a folder of compiled kernels; sets the module's flags."""
     shipped_modules()  # a Warp module is known once its file is imported
-    module, flags = wp.get_module(name), shipped.flags(loading.FLAG)
+    module: Any = wp.get_module(name)
+    flags = shipped.flags(loading.FLAG)
     module.options["cpu_compiler_flags"] = flags
     module.mark_modified()
     return folder / wp.get_cpu_kernel_cache_key(cpu_compiler_flags=flags) / module.get_module_identifier(1)
