@@ -286,8 +286,9 @@ def is_around(
     return same_surface(settings, guides, i, guides.guide_position[i], guides, j)
 
 
-# Share out what the light of pixel i has above a limit among it and the pixels around in the block from (x0, y0); their
-# sum stays. The limit is a multiple of the root of the mean square of earlier light there.
+# Share out what the light of pixel i has above a limit among it and the pixels around in the block from (x0, y0).
+# The limit is a multiple of the root of the mean square of earlier light there; no pixel gets more than that root
+# itself, so that no block is seen. What is left is lost.
 @wp.func
 def share_outlier(
     settings: DenoiseSettings,
@@ -316,10 +317,11 @@ def share_outlier(
     if count < LEAST_AROUND or frames < LEAST_KNOWN:
         return
     own = luminance(light[i])
-    limit = settings.outliers * wp.sqrt(square / frames)
+    typical = wp.sqrt(square / frames)
+    limit = settings.outliers * typical
     if own <= limit:
         return
-    part = light[i] * ((1.0 - limit / own) / (count + 1.0))
+    part = light[i] * (wp.min((own - limit) / (count + 1.0), typical) / own)
     light[i] = light[i] * (limit / own) + part
     for k in range(BLOCK * BLOCK):
         x = x0 + k % BLOCK

@@ -71,7 +71,8 @@ class SpatioTemporal(Denoiser):
 
     outliers: float = 6.0
     """Times the root mean square of earlier light around a pixel, in a block of 8x8 and on its surface, above which its
-    new light is shared out there: what one ray of many found would stay as a dot. The sum is kept. 0 never shares."""
+    new light is shared out there: what one ray of many found would stay as a dot. No pixel gets more than the root mean
+    square itself: above some 70 times of it, light is lost. 0 never shares."""
 
     first_samples: int = 4
     """Samples a pixel, at least, of a frame without a frame before, 1 to 65536: the first one, a still, or after a cut.
