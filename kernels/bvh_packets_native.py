@@ -378,3 +378,34 @@ INTERSECT_PACKETS = cpu_only(
         }""",
     FEW=FEW,
 )
+# Closest hits of a square of 4 x 4 pixels of a picture. Their origins are in t, u, v.
+INTERSECT_PIXELS = cpu_only(
+    CLOSEST_PACKET
+    + "Query query = {"
+    + BVH
+    + """
+        {}, {}
+    };
+    Packet packet;
+    int index[16];
+    for (int k = 0; k < 16; ++k) {
+        const bool seen = x + (k & 3) < width && y + (k >> 2) < height;
+        const int i = seen ? (y + (k >> 2)) * width + x + (k & 3) : y * width + x;
+        const wp::vec3 d = hits.direction.data[i];
+        packet.origin[0][k] = hits.t.data[i], packet.origin[1][k] = hits.u.data[i];
+        packet.origin[2][k] = hits.v.data[i];
+        for (int axis = 0; axis < 3; ++axis) packet.way[axis][k] = d[axis];
+        packet.limit[k] = seen ? __builtin_inff() : -1.0f;
+        index[k] = seen ? i : -1;
+    }
+    wp::vec4 found[16];
+    query.together(packet, found);
+    for (int k = 0; k < 16; ++k) {
+        const int i = index[k];
+        if (i < 0) continue;
+        hits.t.data[i] = found[k][0], hits.u.data[i] = found[k][1], hits.v.data[i] = found[k][2];
+        hits.face.data[i] = __builtin_bit_cast(int, found[k][3]);
+    }
+""",
+    FEW=FEW,
+)
