@@ -12,6 +12,19 @@ from warp_gi.kernels.bvh_queries_native import ANY_METHODS, BVH, CLOSEST_METHODS
 PACKET = 16  # rays
 FEW = 3  # rays that go on alone
 
+
+def _apart(axis: int) -> str:
+    """Return code for one axis of sixteen vectors in `a`, `b` and `c`."""
+    places = [3 * ray + axis for ray in range(16)]
+    first = ", ".join(str(at if at < 32 else 0) for at in places)
+    second = ", ".join(str(ray if at < 32 else at - 16) for ray, at in enumerate(places))
+    return f"""            parts[{axis}] = __builtin_shufflevector(
+                __builtin_shufflevector(a, b, {first}), c, {second}
+            );"""
+
+
+APART = "\n".join(_apart(axis) for axis in range(3))
+
 # The rays, and the parts that go down together. Rounding is as in Ray: slopes and offsets are the same numbers.
 PACKET_STRUCT = """
     typedef float Floats __attribute__((vector_size(64)));
@@ -26,7 +39,7 @@ PACKET_STRUCT = """
         // of the part that is on its way:
         Ints taken;
         f8 least_slope[3], most_slope[3], near_origin[3], far_origin[3];
-        float farthest;
+        float farthest, widest;  // the largest limit; the largest coordinate of origins
         int near_row[3], far_row[3], x, y, z;  // x, y, z: axes, the dominant one last
 
         static inline Floats low(Floats a, Floats b) { return a < b ? a : b; }
@@ -72,6 +85,7 @@ PACKET_STRUCT = """
             x = (which >> 3) == 2 ? 0 : (which >> 3) + 1, y = (which >> 3) == 0 ? 2 : (which >> 3) - 1, z = which >> 3;
             inverse_z = near_slope[z], shear_x = way[x] / way[z], shear_y = way[y] / way[z];
             const Floats none = {}, far_away = none + 3.4e38f;
+            widest = 0.0f;
             for (int axis = 0; axis < 3; ++axis) {
                 const bool down = which >> axis & 1;
                 near_row[axis] = 32 * axis + (down ? 96 : 0), far_row[axis] = 32 * axis + (down ? 0 : 96);
@@ -79,6 +93,7 @@ PACKET_STRUCT = """
                 most_slope[axis] = most(taken ? near_slope[axis] : -far_away) - (f8) {};
                 const float least_origin = least(taken ? origin[axis] : far_away);
                 const float most_origin = most(taken ? origin[axis] : -far_away);
+                widest = wp::max(widest, wp::max(most_origin, -least_origin));
                 near_origin[axis] = (down ? least_origin : most_origin) - (f8) {};
                 far_origin[axis] = (down ? most_origin : least_origin) - (f8) {};
             }
@@ -98,6 +113,28 @@ PACKET_STRUCT = """
             entry = Ray::high(Ray::high(near[0], near[1]), Ray::high(near[2], (f8) {})) * 0.999998f;
             const f8 leave = Ray::low(Ray::low(far[0], far[1]), Ray::low(far[2], farthest - (f8) {})) * 1.000002f;
             return Ray::bits(entry <= leave);
+        }
+
+        // Bits of a block's triangles that some ray may meet: by their boxes, wider than rounding in `triangle`.
+        inline unsigned near(const float* block) const {
+            f8 low[3], high[3], largest = {};
+            for (int axis = 0; axis < 3; ++axis) {
+                const f8 a = *(const f8*)(block + LANES * axis), b = *(const f8*)(block + LANES * (3 + axis));
+                const f8 c = *(const f8*)(block + LANES * (6 + axis));
+                low[axis] = Ray::low(Ray::low(a, b), c), high[axis] = Ray::high(Ray::high(a, b), c);
+                largest = Ray::high(largest, Ray::high(high[axis], -low[axis]));
+            }
+            const f8 pad = (largest + widest) * 1e-6f;
+            f8 enter = {}, leave = farthest - (f8) {};
+            for (int axis = 0; axis < 3; ++axis) {
+                const bool down = near_row[axis] > far_row[axis];
+                const f8 under = low[axis] - pad, over = high[axis] + pad;
+                const f8 a = (down ? over : under) - near_origin[axis], b = (down ? under : over) - far_origin[axis];
+                enter = Ray::high(enter, Ray::low(a * least_slope[axis], a * most_slope[axis]));
+                leave = Ray::low(leave, Ray::high(b * least_slope[axis], b * most_slope[axis]));
+            }
+            const i8 faces = *(const i8*)((const int*)block + FACE_WORD);
+            return Ray::bits((enter * 0.999998f <= leave * 1.000002f) & (faces >= 0));
         }
 
         // The rays that enter a child before their limit.
@@ -141,10 +178,18 @@ PACKET_STRUCT = """
             return inside & (t > 0.0f) & (t < limit);
         }
 
+        // Sixteen vectors that follow each other, by axis.
+        static inline void apart(const void* at, Floats* parts) {
+            struct __attribute__((packed)) Loose { Floats lanes; };
+            const Loose* from = (const Loose*)at;
+            const Floats a = from[0].lanes, b = from[1].lanes, c = from[2].lanes;
+APART
+        }
+
         inline f4 start_of(int i) const { return (f4) {origin[0][i], origin[1][i], origin[2][i], 0.0f}; }
         inline f4 way_of(int i) const { return (f4) {way[0][i], way[1][i], way[2][i], 0.0f}; }
     };
-"""
+""".replace("APART", APART)
 
 # Methods of Query. `lead` makes the query that of one ray, whose set-up is kept in `alone`.
 TOGETHER = """
@@ -215,11 +260,10 @@ ANY_PACKET = (
                         }
                     } else {
                         const float* block = block_at(child);
-                        const Bools some = __builtin_bit_cast(Bools, (unsigned short)active);
-                        Ints left = __builtin_convertvector(some, Ints) != 0;
-                        for (int lane = 0; lane < LANES; ++lane) {
-                            const int face = ((const int*)block)[FACE_WORD + lane];
-                            if (face < 0) break;
+                        const Bools lanes_left = __builtin_bit_cast(Bools, (unsigned short)active);
+                        Ints left = __builtin_convertvector(lanes_left, Ints) != 0;
+                        for (unsigned some = packet.near(block); some; some &= some - 1) {
+                            const int lane = __builtin_ctz(some), face = ((const int*)block)[FACE_WORD + lane];
                             Floats t, u, v;
                             Ints hit = packet.triangle(block + lane, left, t, u, v);
                             if (!Packet::bits(hit)) continue;
@@ -303,9 +347,8 @@ CLOSEST_PACKET = (
                     } else {
                         const float* block = block_at(child);
                         unsigned changed = 0;
-                        for (int lane = 0; lane < LANES; ++lane) {
-                            const int face = ((const int*)block)[FACE_WORD + lane];
-                            if (face < 0) break;
+                        for (unsigned some = packet.near(block); some; some &= some - 1) {
+                            const int lane = __builtin_ctz(some), face = ((const int*)block)[FACE_WORD + lane];
                             Floats t, u, v;
                             Ints hit = packet.triangle(block + lane, active, t, u, v);
                             if (!Packet::bits(hit)) continue;
@@ -342,10 +385,20 @@ PACKETS = (
     };
     const bool ordered = rays.order.shape[0] > 0;
     const int last_limit = (int)rays.t_max.shape[0] - 1;
+    const bool limited = last_limit > 0;
     for (int item = begin; item < end; item += 16) {
         const int count = end - item < 16 ? end - item : 16;
         Packet packet;
         int index[16];
+        if (!ordered && count == 16) {
+            Packet::apart(rays.origins.data + item, packet.origin);
+            Packet::apart(rays.directions.data + item, packet.way);
+            for (int k = 0; k < 16; ++k) index[k] = item + k;
+            const char* limits = (const char*)rays.t_max.data;
+            if (!limited) packet.limit = *(const float*)limits - (Floats) {};
+            else for (int k = 0; k < 16; ++k)
+                packet.limit[k] = *(const float*)(limits + (item + k) * (long long)rays.t_max.strides[0]);
+        } else
         for (int k = 0; k < 16; ++k) {
             const int at = item + (k < count ? k : 0), i = ordered ? (int)rays.order.data[at] : at;
             const wp::vec3 o = rays.origins.data[i], d = rays.directions.data[i];
