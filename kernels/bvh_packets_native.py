@@ -10,7 +10,7 @@ from warp_gi.kernels.bvh_native import cpu_only
 from warp_gi.kernels.bvh_queries_native import ANY_METHODS, BVH, CLOSEST_METHODS
 
 PACKET = 16  # rays
-FEW = 3  # rays that go on alone
+FEW = 2  # rays that go on alone
 
 
 def _apart(axis: int) -> str:
