@@ -462,3 +462,27 @@ INTERSECT_PIXELS = cpu_only(
 """,
     FEW=FEW,
 )
+
+# Distances to what rays from one point meet, infinite for none: of a square of 4 x 4 of the `side` x `side` directions.
+FAN_DISTANCES = cpu_only(
+    CLOSEST_PACKET
+    + "Query query = {"
+    + BVH
+    + """
+        {}, {}
+    };
+    Packet packet;
+    for (int k = 0; k < 16; ++k) {
+        const bool inside = x + (k & 3) < side && y + (k >> 2) < side;
+        const wp::vec3 d = wp::mul(frame, local.data[inside ? (y + (k >> 2)) * side + x + (k & 3) : y * side + x]);
+        for (int axis = 0; axis < 3; ++axis) packet.origin[axis][k] = origin[axis], packet.way[axis][k] = d[axis];
+        packet.limit[k] = inside ? __builtin_inff() : -1.0f;
+    }
+    wp::vec4 found[16];
+    query.together(packet, found);
+    for (int k = 0; k < 16; ++k)
+        if (x + (k & 3) < side && y + (k >> 2) < side)
+            distances.data[start + (y + (k >> 2)) * side + x + (k & 3)] = found[k][0];
+""",
+    FEW=FEW,
+)
