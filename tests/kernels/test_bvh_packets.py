@@ -7,13 +7,17 @@ import pytest
 import warp as wp
 from ray_tools import rays, soup
 
+import warp_gi as gi
+from warp_gi import launch
 from warp_gi.bvh import AlphaMasks, TriangleBvh
-from warp_gi.kernels import types
+from warp_gi.kernels import camera_rays, gbuffer, types
+from warp_gi.kernels import visibility_polygons_bake as maps
+from warp_gi.scene.pinhole import camera_data
 
 CPU = wp.get_device("cpu")
 
 
-def camera_rays(count):
+def fan(count):
     """Return rays whose sixteen neighbours are close, across octants and dominant axes."""
     x, y = np.meshgrid(np.linspace(-1.2, 1.2, count), np.linspace(-1.2, 1.2, count))
     directions = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3).astype(np.float32)
@@ -44,7 +48,7 @@ def test_packets_find_what_single_rays_find(masked):
         mask = np.arange(3000, dtype=np.int32) % 3 - 1
         alpha = AlphaMasks(mask, [(-1, 0.2, 0.5), (-1, 0.5, None)], np.zeros((9000, 2), np.float32), *nothing)
     tree = TriangleBvh(points, indices, alpha=alpha)
-    origins, directions = camera_rays(151)  # no whole number of packets
+    origins, directions = fan(151)  # no whole number of packets
     limits = rng.uniform(0.2, 3.0, len(origins)).astype(np.float32)
     assert 0.3 < agree(tree, origins, directions, np.inf)
     assert 0.2 < agree(tree, origins, directions, limits)
@@ -56,13 +60,13 @@ def test_packets_with_rays_that_are_none_or_extreme():
     rng = np.random.default_rng(42)
     points, indices = soup(rng, 2000, 0.1)
     tree = TriangleBvh(points, indices)
-    origins, directions = camera_rays(100)
+    origins, directions = fan(100)
     limits = np.full(len(origins), np.inf, np.float32)
     directions[3::16] = 0.0
     directions[4::32] *= np.float32(1e-20)
     directions[5::32] *= np.float32(1e20)
     directions[6::32, :2] = np.float32([-0.0, 0.0])
-    origins[7::64, 1] = np.nan
+    origins[15::64, 1] = np.nan
     directions[8::64, 2] = np.nan
     origins[9::64, 0] = np.inf
     limits[10::32], limits[11::32], limits[12::32] = 0.0, -1.0, np.nan
@@ -87,3 +91,75 @@ def test_no_packet_leaks_through_a_closed_mesh():
     origins = np.zeros_like(directions)
     assert (tree.intersect(origins, directions, coherent=True).face.numpy() >= 0).all()
     assert tree.occluded(origins, directions, coherent=True).numpy().all()
+
+
+def hits_of(count):
+    """Return room for the hits of camera rays."""
+    hits = gbuffer.PrimaryHits()
+    hits.direction = wp.zeros(count, dtype=wp.vec3, device=CPU)
+    hits.t, hits.u, hits.v = (wp.zeros(count, dtype=wp.float32, device=CPU) for _ in range(3))
+    hits.face = wp.zeros(count, dtype=wp.int32, device=CPU)
+    return hits
+
+
+@pytest.mark.parametrize("kind", ["perspective", "orthographic"])
+def test_camera_rays_find_what_single_rays_find(kind):
+    rng = np.random.default_rng(44)
+    tree = TriangleBvh(*soup(rng, 2000, 0.05))
+    resolution = 37, 21  # no whole number of tiles, nor of packets
+    view = {"eye": (0.4, 0.6, 2.5), "target": (0.5, 0.5, 0.5), "resolution": resolution}
+    camera = gi.Camera.look_at(**view) if kind == "perspective" else gi.Camera.orthographic(**view, width=1.5)
+    scene, hits = types.SceneData(), hits_of(37 * 21)
+    scene.bvh = tree.data
+    data, settings = camera_data(camera), gbuffer.PassSettings()
+    settings.camera_samples, settings.sample_count = 1, 1
+    inputs = [scene, data, settings, camera_rays.PACKET, hits]
+    launch.launch(camera_rays.trace_primary, 5 * 3 * gbuffer.TILE**2 // camera_rays.PACKET, inputs, CPU)
+    x, y = np.meshgrid((np.arange(37) + 0.5) / 37 * 2 - 1, 1 - (np.arange(21) + 0.5) / 21 * 2)
+    right, up, forward, position = (np.array(getattr(data, name)) for name in ("right", "up", "forward", "position"))
+    plane = (x[..., None] * right + y[..., None] * up).reshape(-1, 3)
+    expected = forward + plane * data.spread
+    directions = hits.direction.numpy()
+    np.testing.assert_allclose(directions, expected / np.linalg.norm(expected, axis=1, keepdims=True), atol=1e-6)
+    found = tree.intersect(position + plane * (1.0 - data.spread), directions)
+    face = found.face.numpy()
+    assert (face >= 0).mean() > 0.3
+    same = hits.face.numpy() == face  # origins differ by a rounding
+    assert same.mean() > (0.999 if kind == "perspective" else 0.995)
+    for name in ("t", "u", "v"):
+        np.testing.assert_allclose(getattr(hits, name).numpy()[same], getattr(found, name).numpy()[same], atol=2e-4)
+
+
+@pytest.mark.parametrize("side", [8, 13])
+def test_maps_of_directions_hold_the_distances_of_single_rays(side):
+    rng = np.random.default_rng(45)
+    points, indices = soup(rng, 300, 0.1)
+    tree = TriangleBvh(points, indices)
+    batch, scene = maps.ContourBatch(), types.SceneData()
+    scene.bvh = tree.data
+    batch.start, batch.resolution, batch.offset = 1, side, 0.01
+    places = rng.random((3, 3)).astype(np.float32)
+    batch.positions = wp.array(places, dtype=wp.vec3, device=CPU)
+    normals = np.float32([[0, 0, 1], [0, 1, 0], [0.6, 0, -0.8]])
+    batch.normals = wp.array(normals, dtype=wp.vec3, device=CPU)
+    batch.distances = wp.full(2 * side * side, -1.0, dtype=wp.float32, device=CPU)
+    directions = wp.zeros(side * side, dtype=wp.vec3, device=CPU)
+    launch.launch(maps.map_directions, side * side, [side, directions], CPU)
+    bands = -(-side // maps.BAND)
+    launch.launch(maps.trace_maps, 2 * bands, [scene, batch, maps.BAND, directions], CPU)
+    distances = batch.distances.numpy().reshape(2, -1)
+    local = directions.numpy()
+    assert (local[:, 2] >= 0.0).all() and abs(local.mean(axis=0)[:2]).max() < 1e-6
+    for item in (0, 1):
+        normal = normals[1 + item].astype(np.float64)
+        sign = 1.0 if normal[2] >= 0.0 else -1.0
+        first = -1.0 / (sign + normal[2])
+        cross = normal[0] * normal[1] * first
+        tangent = 1.0 + sign * normal[0] ** 2 * first, sign * cross, -sign * normal[0]
+        other = cross, sign + normal[1] ** 2 * first, -normal[1]
+        away = local @ np.stack([tangent, other, normal])
+        origins = np.tile(places[1 + item] + 0.01 * normal, (side * side, 1))
+        expected = tree.intersect(origins, away).t.numpy()
+        assert 0.2 < np.isfinite(expected).mean() < 1.0
+        same = np.isclose(distances[item], expected, rtol=1e-3) | (np.isinf(distances[item]) & np.isinf(expected))
+        assert same.mean() > 0.98  # directions differ by a rounding
