@@ -66,7 +66,7 @@ def test_packets_with_rays_that_are_none_or_extreme():
     directions[4::32] *= np.float32(1e-20)
     directions[5::32] *= np.float32(1e20)
     directions[6::32, :2] = np.float32([-0.0, 0.0])
-    origins[15::64, 1] = np.nan
+    origins[15::64, 2] = np.nan
     directions[8::64, 2] = np.nan
     origins[9::64, 0] = np.inf
     limits[10::32], limits[11::32], limits[12::32] = 0.0, -1.0, np.nan
