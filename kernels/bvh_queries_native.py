@@ -72,18 +72,16 @@ RAYS = (
 
 # A query for any hit: the child (a block) that is in the ray's way, or 0. What lies below the node `hint` is tried
 # first.
-ANY = (
+ANY_METHODS = (
     TRAVERSAL
     + """
-        __attribute__((noinline)) int run(
-            float ox, float oy, float oz, float dx, float dy, float dz, float t_max, int hint
+        // Of a ray that is set up: what lies below `child`, then below the root if asked for.
+        inline __attribute__((always_inline)) int below(
+            const Ray& ray, float limit, int child, bool and_root
         ) const {
-            Ray ray;
-            if (!ray.setup((f4) {ox, oy, oz, 0.0f}, (f4) {dx, dy, dz, 1.0f})) return 0;
-            const float limit = t_max / ray.scale;
             int stack[STACK_SIZE];
-            int size = 0, child = hint;
-            if (hint) stack[size++] = 0;  // the root, should nothing below the hint be in the way
+            int size = 0;
+            if (and_root) stack[size++] = 0;
             while (true) {
                 if (child >= 0) {
                     const char* node = node_at(child);
@@ -120,14 +118,21 @@ ANY = (
                 child = stack[--size];
             }
         }
-    };
+        __attribute__((noinline)) int run(
+            float ox, float oy, float oz, float dx, float dy, float dz, float t_max, int hint
+        ) const {
+            Ray ray;
+            if (!ray.setup((f4) {ox, oy, oz, 0.0f}, (f4) {dx, dy, dz, 1.0f})) return 0;
+            return below(ray, t_max / ray.scale, hint, hint != 0);  // the root, should the hint be in nobody's way
+        }
 """
 )
+ANY = ANY_METHODS + "    };\n"
 
 # The triangle test's t is the less exact the more edge-on a triangle is: it is found anew, in double precision, and so
 # are u, v. What rounding would put out of its range stays in. The stack holds what is left to visit, each
 # node's children from far to near.
-CLOSEST = (
+CLOSEST_METHODS = (
     TRAVERSAL
     + """
 #if VECTORS_PAY
@@ -168,20 +173,16 @@ CLOSEST = (
             hit[3] = __builtin_bit_cast(float, ((const int*)at)[FACE_WORD] & ~FACE_MASKED);
             return hit;
         }
-        __attribute__((noinline)) wp::vec4 run(
-            float ox, float oy, float oz, float dx, float dy, float dz, float t_max
+        // Of a ray that is set up: the closest hit below `child`, if nearer than the limit, which it becomes.
+        inline __attribute__((always_inline)) void below(
+            const Ray& ray, float& limit, int child, const float*& nearest_at, wp::vec4& hit
         ) const {
-            Ray ray;
-            wp::vec4 hit(t_max, 0.0f, 0.0f, __builtin_bit_cast(float, -1));
-            if (!ray.setup((f4) {ox, oy, oz, 0.0f}, (f4) {dx, dy, dz, 1.0f})) return hit;
-            float limit = t_max / ray.scale;
-            const float* nearest_at = nullptr;  // the vertices of the triangle hit, one number in LANES
 #if VECTORS_PAY
             int stack[STACK_SIZE], distances[STACK_SIZE];  // children, and the bits of their entry distances
 #else
             Entry stack[STACK_SIZE];
 #endif
-            int size = 0, child = 0;
+            int size = 0;
             while (true) {
                 if (child >= 0) {
                     const char* node = node_at(child);
@@ -245,23 +246,34 @@ CLOSEST = (
                 }
 #if VECTORS_PAY
                 do {
-                    if (!size) return nearest_at ? exact(nearest_at, t_max, hit) : hit;
+                    if (!size) return;
                 } while (__builtin_bit_cast(float, distances[--size]) > limit * 1.000001f);
                 child = stack[size];
 #else
                 Entry top;
                 do {
-                    if (!size) return nearest_at ? exact(nearest_at, t_max, hit) : hit;
+                    if (!size) return;
                     top = stack[--size];
                 } while (__builtin_bit_cast(float, (unsigned)(top >> 32)) > limit * 1.000001f);
                 child = (int)(unsigned)top;
 #endif
             }
         }
-    };
+        __attribute__((noinline)) wp::vec4 run(
+            float ox, float oy, float oz, float dx, float dy, float dz, float t_max
+        ) const {
+            Ray ray;
+            wp::vec4 hit(t_max, 0.0f, 0.0f, __builtin_bit_cast(float, -1));
+            if (!ray.setup((f4) {ox, oy, oz, 0.0f}, (f4) {dx, dy, dz, 1.0f})) return hit;
+            float limit = t_max / ray.scale;
+            const float* nearest_at = nullptr;  // the vertices of the triangle hit, one number in LANES
+            below(ray, limit, 0, nearest_at, hit);
+            return nearest_at ? exact(nearest_at, t_max, hit) : hit;
+        }
 """
     % SORT
 )
+CLOSEST = CLOSEST_METHODS + "    };\n"
 
 OCCLUDED = ANY + ONE_RAY % ", hint"
 INTERSECT = CLOSEST + ONE_RAY % ""

@@ -3,7 +3,6 @@
 import warp as wp
 
 from warp_gi.kernels.bsdf import average_specular
-from warp_gi.kernels.bvh import bvh_intersect
 from warp_gi.kernels.environment import environment_radiance
 from warp_gi.kernels.sampling import CAMERA_DIMENSION, filter_offset, pixel_sample_index, pixel_seed, sample_2d
 from warp_gi.kernels.surface import Surface, shading_normal, surface_at, surface_emission
@@ -131,23 +130,6 @@ def primary_sample(settings: PassSettings, p: wp.vec2i) -> wp.vec2:
         u = sample_2d(index, seed, CAMERA_DIMENSION)
         offset = wp.vec2(filter_offset(settings.tent, u[0]), filter_offset(settings.tent, u[1]))
     return wp.vec2(wp.float32(p[0]) + 0.5 + offset[0], wp.float32(p[1]) + 0.5 + offset[1])
-
-
-# Thread: a pixel. Traces one camera ray.
-@wp.kernel
-def trace_primary(first: wp.int32, scene: SceneData, camera: CameraData, settings: PassSettings, hits: PrimaryHits):
-    p = tiled_pixel(first + wp.tid(), camera.width)
-    if p[0] >= camera.width or p[1] >= camera.height:
-        return
-    at = primary_sample(settings, p)
-    direction = camera_ray(camera, at[0], at[1])
-    hit = bvh_intersect(scene.bvh, camera_origin(camera, at[0], at[1]), direction, float(wp.inf))
-    pixel = p[1] * camera.width + p[0]
-    hits.direction[pixel] = direction
-    hits.t[pixel] = hit.t
-    hits.u[pixel] = hit.u
-    hits.v[pixel] = hit.v
-    hits.face[pixel] = hit.face
 
 
 # Where the point (u, v) of a triangle was in the previous frame.

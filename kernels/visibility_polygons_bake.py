@@ -7,12 +7,14 @@ the edges of the grid that contours cross, and more rays where on the edge: by h
 
 import warp as wp
 
-from warp_gi.kernels.bvh import bvh_intersect
+from warp_gi.kernels.bvh import bvh_intersect, runs_on_cuda
+from warp_gi.kernels.bvh_packets_native import FAN_DISTANCES
 from warp_gi.kernels.sampling import frame_of
-from warp_gi.kernels.types import SceneData
+from warp_gi.kernels.types import Bvh, SceneData
 
 wp.set_module_options({"enable_backward": False})
 
+BAND = 4  # rows of a map that go together on the CPU, see FAN_DISTANCES
 HALVINGS = wp.constant(9)
 SMALLEST_CONTOUR = wp.constant(wp.float32(2.0e-4))  # sr: smaller contours are left out
 HORIZON = wp.constant(wp.float32(-1.0))  # "distance" of nodes on the border
@@ -70,18 +72,51 @@ def node_place(x: wp.int32, y: wp.int32, resolution: wp.int32) -> wp.vec2:
     )
 
 
-# Thread: a row of the map of a set of the batch. Writes the distances at its nodes.
+# Thread: a node. Its direction about z.
 @wp.kernel
-def trace_maps(first: wp.int32, scene: SceneData, batch: ContourBatch):
+def map_directions(first: wp.int32, resolution: wp.int32, directions: wp.array(dtype=wp.vec3)):
+    node = first + wp.tid()
+    y = node / resolution
+    directions[node] = hemisphere_decode(node_place(node - y * resolution, y, resolution))
+
+
+# CPU: the distances of 4 x 4 nodes from x, y on, of the map that starts at `start`.
+@wp.func_native(FAN_DISTANCES)
+def fan_distances(
+    bvh: Bvh,
+    origin: wp.vec3,
+    frame: wp.mat33,
+    local: wp.array(dtype=wp.vec3),
+    x: wp.int32,
+    y: wp.int32,
+    side: wp.int32,
+    start: wp.int32,
+    distances: wp.array(dtype=wp.float32),
+): ...
+
+
+# Thread: `share` rows of the map of a set of the batch, BAND on the CPU and one on CUDA. Writes the distances at its
+# nodes.
+@wp.kernel
+def trace_maps(
+    first: wp.int32, scene: SceneData, batch: ContourBatch, share: wp.int32, directions: wp.array(dtype=wp.vec3)
+):
     item = first + wp.tid()
-    local = item / batch.resolution
-    y = item - local * batch.resolution
+    side = batch.resolution
+    bands = (side + share - 1) / share
+    local = item / bands
+    y = (item - local * bands) * share
     normal = batch.normals[batch.start + local]
     frame = frame_of(normal)
     origin = batch.positions[batch.start + local] + normal * batch.offset
-    for x in range(batch.resolution):
-        direction = frame * hemisphere_decode(node_place(x, y, batch.resolution))
-        batch.distances[item * batch.resolution + x] = ray_distance(scene, origin, direction)
+    start = local * side * side
+    if runs_on_cuda() != 0:
+        for x in range(side):
+            node = y * side + x
+            batch.distances[start + node] = ray_distance(scene, origin, frame * directions[node])
+    else:
+        for x in range(0, side, 4):
+            fan_distances(scene.bvh, origin, frame, directions, x, y, side, start, batch.distances)
 
 
 @wp.func

@@ -11,7 +11,7 @@ from statistics_tools import device
 
 import warp_gi as gi
 from warp_gi import launch
-from warp_gi.kernels import gbuffer, path_trace, types
+from warp_gi.kernels import camera_rays, gbuffer, path_trace, types
 from warp_gi.kernels.path_trace import TERM_EMITTERS, TERM_ENVIRONMENT, TERM_INDIRECT
 from warp_gi.paths import sky_probability
 from warp_gi.scene.pinhole import camera_data
@@ -59,7 +59,8 @@ def trace(
     passes.sample_bits = (spp - 1).bit_length()
     hits = _filled(gbuffer.PrimaryHits, width * height)
     buffers = _filled(path_trace.PathBuffers, width * height)
-    launch.launch(gbuffer.trace_primary, items, [data, view, passes, hits], device())
+    share = camera_rays.PACKET if device().is_cpu else 1
+    launch.launch(camera_rays.trace_primary, items // share, [data, view, passes, share, hits], device())
     samplers = tracer.samplers()
     if fill is not None:
         fill(samplers, items)

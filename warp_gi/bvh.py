@@ -12,6 +12,7 @@ import warp as wp
 from warp_gi import launch, wide_tree
 from warp_gi.errors import SceneError, check_near, unknown_name
 from warp_gi.kernels import bvh_native as layout
+from warp_gi.kernels import bvh_packets as packets
 from warp_gi.kernels import bvh_rays as batch
 from warp_gi.kernels import types
 
@@ -157,26 +158,28 @@ class TriangleBvh:
         else:
             self._mesh.refit()
 
-    def occluded(self, origins: object, directions: object, t_max: object = np.inf) -> wp.array:
+    def occluded(self, origins: object, directions: object, t_max: object = np.inf, coherent: bool = False) -> wp.array:
         """Return uint8 [ray]: 1 where something lies at 0 < t < t_max.
 
         ``origins`` and ``directions`` are float32 [ray, 3], ``t_max`` a number or float32 [ray], in units of the
-        direction's length. Raises SceneError on other shapes.
+        direction's length. ``coherent`` says that each sixteen neighbours start near each other and go the same way,
+        as camera rays do and shadow rays to a point light: the CPU traces them together, with the same results.
+        Raises SceneError on other shapes.
         """
         rays = self._rays(origins, directions, t_max)
         count = len(rays.origins)
         result = wp.empty(count, dtype=wp.uint8, device=self.device)
-        self._trace(batch.occluded_rays, rays, result)
+        self._trace(packets.occluded_packets if coherent else batch.occluded_rays, rays, result)
         return result
 
-    def intersect(self, origins: object, directions: object, t_max: object = np.inf) -> Hits:
+    def intersect(self, origins: object, directions: object, t_max: object = np.inf, coherent: bool = False) -> Hits:
         """Return the closest hits at 0 < t < t_max; arguments and errors as ``occluded``."""
         rays = self._rays(origins, directions, t_max)
         count = len(rays.origins)
         hits = batch.RayHits()
         hits.t, hits.u, hits.v = (wp.empty(count, dtype=wp.float32, device=self.device) for _ in range(3))
         hits.face = wp.empty(count, dtype=wp.int32, device=self.device)
-        self._trace(batch.intersect_rays, rays, hits)
+        self._trace(packets.intersect_packets if coherent else batch.intersect_rays, rays, hits)
         return Hits(hits.t, hits.face, hits.u, hits.v)
 
     def _trace(self, kernel: wp.Kernel, rays: batch.RayBatch, found: object) -> None:

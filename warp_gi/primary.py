@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from warp_gi.kernels import gbuffer, layers
+from warp_gi import launch
+from warp_gi.kernels import camera_rays, gbuffer, layers
 from warp_gi.layers import has_layers
 from warp_gi.scene.baked import whole_scene
 from warp_gi.stateful import Stateful
@@ -35,14 +36,16 @@ class CameraRays(Primary):
     """Camera rays through the scene, jittered inside of each pixel."""
 
     def kernels(self, scene: Scene | BakedScene | None = None) -> tuple[wp.Kernel, ...]:
-        """Return the kernel that shades hits."""
+        """Return the kernels that trace rays and shade hits."""
         blends = scene is not None and any(one.has_chance for one in whole_scene(scene).materials)
-        return (layers.shade_layers if blends else gbuffer.shade_primary,)
+        return camera_rays.trace_primary, layers.shade_layers if blends else gbuffer.shade_primary
 
     def trace(self, frame: Frame, state: Any) -> None:
         """Trace the rays and shade what they hit."""
         settings, cameras = frame.pass_settings, [frame.camera_data, frame.previous_camera_data]
-        frame.launch_tiled(gbuffer.trace_primary, [frame.data, frame.camera_data, settings, frame.hits])
+        share = camera_rays.PACKET if frame.device.is_cpu else 1
+        inputs: list[object] = [frame.data, frame.camera_data, settings, share, frame.hits]
+        launch.launch(camera_rays.trace_primary, frame.tiled_items // share, inputs, frame.device, camera_rays.PACKET)
         buffers = frame.struct(gbuffer.SurfaceBuffers)
         inputs = [frame.layer_data, *cameras, settings, frame.hits, buffers]
         if has_layers(frame.data):

@@ -42,7 +42,9 @@ def test_rows_hold_every_contender_and_all_agree(monkeypatch):
     for row in races:
         assert row["ours Mrays/s"] > 0.0 and row["ours in order Mrays/s"] > 0.0
         assert (row["rays"] == "shadow") == ("ours / warp" not in row)  # its query has no limits here
+        assert (row["rays"] == "diffuse") == ("coherent / ours" not in row)
         if has_peer:
+            assert (row["rays"] == "diffuse") == ("coherent / embree packets" not in row)
             assert row["agree"] > 0.999 and row["ours / embree"] > 0.0 and row["ours / embree robust"] > 0.0
             assert 0.0 < row["ours / best"] <= min(row["ours / embree"], row["ours / embree high"]) * 1.000001
             assert (row["rays"] == "diffuse") == ("ours / embree packets" not in row)

@@ -124,6 +124,29 @@ def test_hits_are_exact_where_triangles_are_edge_on():
     assert (limited.t.numpy()[found] < (t * np.float32(1.0000005))[found]).all()
 
 
+def test_exact_hits_stay_inside_of_their_triangle_and_their_limit():
+    rng = np.random.default_rng(22)
+    points, indices = soup(rng, 300, 0.2)
+    points[2::3] = points[::3] + 0.5 * (points[1::3] - points[::3]) + rng.normal(size=(300, 3)) * 0.003  # slivers
+    tree = TriangleBvh(points, indices)
+    weights = rng.dirichlet([1, 1, 1], 20000)
+    weights[np.arange(20000), rng.integers(3, size=20000)] = 0.0  # on edges
+    weights /= weights.sum(axis=1, keepdims=True)
+    target = (points[indices[rng.integers(300, size=20000)]].astype(np.float64) * weights[..., None]).sum(1)
+    directions = rng.normal(size=(20000, 3)).astype(np.float32)
+    origins = (target - 2.0 * directions).astype(np.float32)
+    free = tree.intersect(origins, directions)
+    t, u, v, face = (getattr(free, name).numpy() for name in ("t", "u", "v", "face"))
+    hit = face >= 0
+    assert hit.sum() > 5000 and ((u[hit] == 0.0) | (v[hit] == 0.0) | (u[hit] + v[hit] == 1.0)).sum() > 100
+    assert (u[hit] >= 0.0).all() and (v[hit] >= 0.0).all() and (u[hit] + v[hit] <= 1.0).all()
+    for error in (1e-7, 1e-6, 1e-5):  # about those of the test that is made before
+        limits = np.where(hit, t * (1.0 + rng.uniform(-error, error, 20000)), 10.0).astype(np.float32)
+        limited = tree.intersect(origins, directions, limits)
+        found = limited.face.numpy() >= 0
+        assert found.sum() > 1000 and (limited.t.numpy()[found] < limits[found]).all()
+
+
 @pytest.mark.parametrize("scale", [1e-4, 1e-2, 1.0, 1e3, 1e6])
 @pytest.mark.parametrize("shift", [0.0, 1.0])
 def test_tiny_and_huge_coordinates(scale, shift):

@@ -13,6 +13,7 @@ from ray_tools import rays, soup
 
 from warp_gi.bvh import AlphaMasks, TriangleBvh
 from warp_gi.kernels import bvh, types
+from warp_gi.kernels.bvh_packets import intersect_packets_native
 from warp_gi.kernels.bvh_rays import RayBatch, RayHits
 from warp_gi.launch import launch
 
@@ -76,3 +77,39 @@ def test_hits_do_not_depend_on_what_the_cpu_has(march, masked):
     for name in ("t", "u", "v"):
         np.testing.assert_allclose(getattr(hits, name).numpy()[same], getattr(expected, name).numpy()[same], atol=1e-5)
     assert ((occluded.numpy() != 0) == (hits.face.numpy() >= 0)).mean() > 0.9999
+
+
+@functools.cache
+def packets_for(march: str) -> wp.Kernel:
+    """Return a kernel compiled for a level of x86-64: a thread writes the closest hits of sixteen rays."""
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"cpu_compiler_flags": f"-target-cpu {march}"})
+    def packets(first: wp.int32, tree: types.Bvh, batch: RayBatch, hits: RayHits):
+        i = first + wp.tid()
+        intersect_packets_native(tree, batch, 16 * i, wp.min(16 * i + 16, batch.origins.shape[0]), hits)
+
+    return packets
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("march", list(NEEDED))
+def test_packets_do_not_depend_on_what_the_cpu_has(march):
+    if not has(NEEDED[march]):
+        pytest.skip(f"this CPU does not run {march}")
+    rng = np.random.default_rng(32)
+    tree = TriangleBvh(*soup(rng, 1500, 0.08))
+    x, y = np.meshgrid(np.linspace(-1.0, 1.0, 99), np.linspace(-1.0, 1.0, 99))
+    directions = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3).astype(np.float32)
+    origins = np.full_like(directions, (0.5, 0.5, -0.4))
+    expected = tree.intersect(origins, directions)
+    hits, count = RayHits(), len(origins)
+    hits.t, hits.u, hits.v = (wp.zeros(count, dtype=wp.float32, device=CPU) for _ in range(3))
+    hits.face = wp.zeros(count, dtype=wp.int32, device=CPU)
+    inputs = [tree.data, tree._rays(origins, directions, np.inf), hits]
+    launch(packets_for(march), -(-count // 16), inputs, CPU)
+    face = expected.face.numpy()
+    assert (face >= 0).sum() > 3000
+    same = hits.face.numpy() == face
+    assert same.mean() > 0.9998
+    for name in ("t", "u", "v"):
+        np.testing.assert_allclose(getattr(hits, name).numpy()[same], getattr(expected, name).numpy()[same], atol=1e-5)

@@ -5,7 +5,8 @@ CPU time counts. "ours" is the batch call, which on large trees traces incoheren
 in theirs; "ours in order" is without that. "presorted" are the rays of such a batch given in Morton order to both.
 "embree" is its fast mode, which may leak through edges, "embree robust" is watertight like ours; both are of medium
 quality, its default, and "embree high" has spatial splits. "best" is the better of "embree" and "embree high" in each
-turn. "embree packets" are of 16 rays, of the tree that serves them better; ours are single rays.
+turn. "embree packets" are of 16 rays, of the tree that serves them better; "ours coherent" are the same rays in packets
+of 16 of ours, the others single rays.
 """
 
 from __future__ import annotations
@@ -179,6 +180,8 @@ def race(
         "ours in order": lambda: in_order(tree, query, *rays),
     }
     runners |= {key: partial(scene.trace, query, *rays) for key, scene in peers.items()}
+    if packets:
+        runners["ours coherent"] = lambda: trace(tree, query, *rays, coherent=True)
     wide = [f"packets of {key}" for key in FAST if packets and key in peers]
     runners |= {key: partial(peers[key.removeprefix("packets of ")].trace, query, *rays, True) for key in wide}
     if np.ndim(rays[2]) == 0:
@@ -194,7 +197,11 @@ def race(
     for key, values in rates.items():
         if key != "best":
             row |= median_and_spread(f"{key} Mrays/s", values)
-    for key in rates.keys() - {"ours", "ours in order"}:
+    if wide:
+        row |= ratio_and_spread("coherent / embree packets", rates["ours coherent"], rates["embree packets"])
+    if packets:
+        row |= ratio_and_spread("coherent / ours", rates["ours coherent"], rates["ours in order"])
+    for key in rates.keys() - {"ours", "ours in order", "ours coherent"}:
         row |= ratio_and_spread(f"ours / {key}", rates["ours"], rates[key])
         if key != "embree packets":
             row |= ratio_and_spread(f"in order / {key}", rates["ours in order"], rates[key])
@@ -240,12 +247,17 @@ def warp_query(mesh: wp.Mesh, query: str, device: wp.Device, origins: np.ndarray
 
 
 def trace(
-    tree: TriangleBvh, query: str, origins: np.ndarray, directions: np.ndarray, t_max: Any = np.inf
+    tree: TriangleBvh,
+    query: str,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    t_max: Any = np.inf,
+    coherent: bool = False,
 ) -> np.ndarray:
     """Return 0 or 1 (any) or the face (closest) for each ray."""
     if query == "any":
-        return tree.occluded(origins, directions, t_max).numpy()
-    return tree.intersect(origins, directions, t_max).face.numpy()
+        return tree.occluded(origins, directions, t_max, coherent).numpy()
+    return tree.intersect(origins, directions, t_max, coherent).face.numpy()
 
 
 def scaling(tree: TriangleBvh, query: str, rays: Batch, repetitions: int) -> Row:

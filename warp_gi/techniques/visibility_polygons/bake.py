@@ -182,10 +182,13 @@ def find_contours(
     batch.kept = wp.empty(size * MOST_POINTS, dtype=wp.uint8, device=device)
     batch.ends = wp.zeros(size * MOST_CONTOURS, dtype=wp.int32, device=device)
     batch.counts = wp.empty(size, dtype=wp.vec3i, device=device)
+    share = contour_kernels.BAND if device.is_cpu else 1
+    directions = wp.empty(side * side, dtype=wp.vec3, device=device)
+    launch.launch(contour_kernels.map_directions, side * side, [side, directions], device)
     found: list[tuple[np.ndarray, ...]] = []
     for start in range(0, total, size):
         batch.start, count = start, min(size, total - start)
-        launch.launch(contour_kernels.trace_maps, count * side, [data, batch], device)
+        launch.launch(contour_kernels.trace_maps, count * -(-side // share), [data, batch, share, directions], device)
         launch.launch(contour_kernels.find_contours, count, [data, batch], device, smallest_slice=8)
         launch.launch(contour_kernels.simplify_contours, count, [batch], device, smallest_slice=8)
         counts = batch.counts.numpy()[:count]
