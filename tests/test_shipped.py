@@ -64,9 +64,9 @@ def test_what_another_process_has_put_there_stays(objects):
     assert prepared(Module()) == FLAGS and not list((objects.cache / objects.one.name).iterdir())
 
 
-@pytest.mark.parametrize("module", [Module(source="2"), Module(NAME[:-1]), Module(f"{NAME}_1")], ids=str)
-def test_another_source_or_module_is_compiled_as_ever(objects, module):
-    assert prepared(module) == NATIVE and not list(objects.cache.iterdir())
+@pytest.mark.parametrize(("name", "source"), [(NAME, "2"), (NAME[:-1], "1"), (f"{NAME}_1", "1")])
+def test_another_source_or_module_is_compiled_as_ever(objects, name, source):
+    assert prepared(Module(name, source)) == NATIVE and not list(objects.cache.iterdir())
 
 
 def another_key(objects, monkeypatch):
