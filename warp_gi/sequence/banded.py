@@ -10,13 +10,12 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from warp_gi.errors import one_line
 from warp_gi.files import replacing
-from warp_gi.openimageio import native_name
+from warp_gi.openimageio import exr_writer, native_name, reason
 from warp_gi.scene.camera import Camera, frame_time
 from warp_gi.sequence.exr import Attribute, channel_names, plain, stored_format, stored_values
 from warp_gi.sequence.frames import read_frame, written_attributes
@@ -159,13 +158,13 @@ class Rows:
                 spec.attribute(name, _TYPES[value.shape], tuple(np.float32(value).ravel().tolist()))
             else:
                 spec.attribute(name, plain(value))
-        output: Any = oiio.ImageOutput.create("exr")
+        output = exr_writer()
         is_written = output is not None and output.open(native_name(path), spec)
         step = max(BLOCK // (size[0] * spec.nchannels) // LINES, 1) * LINES
         for start in range(0, size[1], step):
             stop = min(start + step, size[1])
             is_written = is_written and output.write_scanlines(start, stop, 0, self.block(start, stop))
-        problem = one_line(oiio.geterror() if output is None else output.geterror())
+        problem = reason(output, "")
         if output is None or not output.close() or not is_written or problem:
             raise OSError(f"cannot write {path}: {problem or 'unknown failure'}")
 
@@ -210,6 +209,9 @@ def render_in_bands(
         if rows.picture:
             write_png(path.with_suffix(".png"), np.concatenate(rows.picture), output.exposure)
         if part is not None:
-            rows.write(part, written_attributes(frame, output.precision), frame.camera.resolution)
+            try:
+                rows.write(part, written_attributes(frame, output.precision), frame.camera.resolution)
+            except OSError as error:
+                raise OSError(str(error).replace(str(part), str(path))) from error
         frame.timings["write"] += time.perf_counter() - started
     return frame
