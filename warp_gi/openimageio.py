@@ -19,13 +19,6 @@ def open_image(path: str | Path) -> Any:
     return oiio.ImageInput.open(native_name(path))
 
 
-def exr_writer() -> Any:
-    """Return an ``OpenImageIO.ImageOutput`` of EXR files, or None: ``reason`` then says why."""
-    import OpenImageIO as oiio
-
-    return oiio.ImageOutput.create("exr") or oiio.ImageOutput.create("exr")  # a forked process fails the first time
-
-
 def native_name(path: str | Path) -> str:
     """Return a file's name for libraries that take UTF-8 alone: of another, that of a link to it, there or not yet."""
     text = str(path)
