@@ -16,7 +16,7 @@ FARTHEST = 1e15
 """Metres from the origin beyond which squares of distances leave float32."""
 FARTHEST_VERTEX = 1e12
 """Metres beyond which products of three lengths leave float32, by which rays are tested against triangles."""
-OF_MACHINE = {"ENOSPC", "EDQUOT", "EIO", "ENOMEM", "ESTALE", "EMFILE", "ENFILE", "EPIPE", "ETIMEDOUT"}
+OF_MACHINE = {"ENOSPC", "EDQUOT", "EFBIG", "EIO", "ENOMEM", "ESTALE", "EMFILE", "ENFILE", "EPIPE", "ETIMEDOUT"}
 """Errors of the system that no argument is to blame for."""
 _BREAKS = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+")
 MOST_NAMES = 64

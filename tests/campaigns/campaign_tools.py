@@ -288,7 +288,7 @@ class Command:
             resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
         return main.main(arguments)
 
-    def wait(self, seconds: float = 600.0) -> int | None:
+    def wait(self, seconds: float = 90.0) -> int | None:
         """Return the exit code, below 0 for a signal; None if it runs on after some seconds."""
         until = time.monotonic() + seconds
         while self.code is None:

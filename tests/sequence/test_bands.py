@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+
 import numpy as np
 import pytest
 
@@ -107,6 +110,22 @@ def test_what_cannot_be_rendered_in_bands_is_one_line(tmp_path, capfd):
     assert capfd.readouterr().err.count("\n") == 1 and not list(tmp_path.iterdir())
     assert cli.main([*command, "--pipeline=path", "--memory=1e-4", "--quiet"]) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs forks")
+def test_a_forked_process_writes_bands_too(tmp_path):
+    """OpenImageIO's threads are only in the parent, which has written some."""
+    render(tmp_path / "parent", "uniform", memory=SMALL)
+    process = multiprocessing.get_context("fork").Process(
+        target=render, args=(tmp_path / "child", "uniform"), kwargs={"memory": SMALL}
+    )
+    process.start()
+    process.join(60)
+    process.kill()
+    assert process.exitcode == 0
+    for number in (0, 2):
+        name = f"a.{number:04d}.exr"
+        assert contents(tmp_path / "child" / name)[0] == contents(tmp_path / "parent" / name)[0]
 
 
 def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):

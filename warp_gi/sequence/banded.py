@@ -1,5 +1,7 @@
 """Files of frames that are rendered in bands: rows wait on the disk until all are there, and go to one file.
 
+A file a channel: OpenEXR reads them as memory that the system fetches from the disk (``numpy.memmap``).
+
 The file is that of a frame at once. Whether a buffer is stored as half is known with its last row (``stored_format``).
 """
 
@@ -10,15 +12,13 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from warp_gi.errors import one_line
 from warp_gi.files import replacing
-from warp_gi.openimageio import native_name
 from warp_gi.scene.camera import Camera, frame_time
-from warp_gi.sequence.exr import Attribute, channel_names, plain, stored_format, stored_values
+from warp_gi.sequence.exr import Attribute, channel_names, stored_format, stored_values, write_channels
 from warp_gi.sequence.frames import read_frame, written_attributes
 from warp_gi.sequence.preview import picture_bytes, tone_map, write_png
 
@@ -28,10 +28,6 @@ if TYPE_CHECKING:
 
 BLOCK = 1 << 24
 """Values that are read from the disk and written at once."""
-LINES = 16
-"""Rows that ZIP compression takes together."""
-_TYPES = {(4, 4): "matrix", (3, 3): "matrix33", (2,): "float2"}
-_OIIO_NAMES = {"pixelAspectRatio": "PixelAspectRatio"}
 
 
 class Storage(Protocol):
@@ -111,7 +107,7 @@ class Rows:
     def __init__(self, folder: Path | None, output: Storage) -> None:
         self.folder, self.output = folder, output
         self.formats: dict[str, str] = {}
-        self.shapes: dict[str, tuple[int, ...]] = {}
+        self.channels: dict[str, tuple[str, ...]] = {}
         self.picture: list[np.ndarray] = []
 
     def add(self, band: BandFrame) -> None:
@@ -120,54 +116,37 @@ class Rows:
             shown = band.numpy("beauty")
             self.picture.append(tone_map(stored_values("beauty", shown), self.output.exposure))
         for name in band.names if self.folder is not None else ():
-            values = np.ascontiguousarray(band.numpy(name), np.float32)
-            self.shapes[name] = values.shape[1:]
+            values = np.asarray(band.numpy(name), np.float32).reshape(len(band.rows), band.camera.resolution[0], -1)
+            self.channels[name] = channel_names(name, values.shape[2])
             stored = stored_format(name, values, self.output.precision)
             self.formats[name] = "float" if "float" in (stored, self.formats.get(name)) else "half"
-            with open(self._path(name), "ab") as file:
-                file.write(values.data)
+            for index, channel in enumerate(self.channels[name]):
+                with open(self._path(channel), "ab") as file:
+                    file.write(np.ascontiguousarray(values[..., index]).data)
 
-    def _path(self, name: str) -> Path:
+    def _path(self, channel: str, format: str = "float") -> Path:
         assert self.folder is not None
-        return self.folder / f"{name}.rows"
+        return self.folder / f"{channel}.{format}"
 
-    def block(self, start: int, stop: int) -> np.ndarray:
-        """Return rows as they are stored, float32 [row, width, channel]."""
-        parts = []
-        for name, shape in self.shapes.items():
-            count = int(np.prod(shape))
-            values = np.fromfile(self._path(name), np.float32, (stop - start) * count, offset=4 * start * count)
-            if self.formats[name] == "half":
-                with np.errstate(over="ignore"):
-                    values = values.astype(np.float16).astype(np.float32)
-            parts.append(values.reshape(stop - start, shape[0], -1))
-        return np.ascontiguousarray(np.concatenate(parts, axis=2))
+    def _plane(self, channel: str, format: str, size: tuple[int, int]) -> np.ndarray:
+        """Return a channel as it is stored, [height, width], in memory as far as it is read."""
+        path = self._path(channel)
+        if format == "half":
+            with open(path, "rb") as source, open(self._path(channel, format), "wb") as target:
+                while len(values := np.frombuffer(source.read(4 * BLOCK), np.float32)):
+                    target.write(values.astype(np.float16).data)
+            path.unlink()
+        dtype = np.float16 if format == "half" else np.float32
+        return np.memmap(self._path(channel, format), dtype, "r", shape=size[::-1])
 
     def write(self, path: Path, attributes: Mapping[str, Attribute], size: tuple[int, int]) -> None:
         """Write the EXR file; raises OSError if it cannot be."""
-        import OpenImageIO as oiio
-
-        channels = {name: channel_names(name, int(np.prod(shape[1:]))) for name, shape in self.shapes.items()}
-        spec = oiio.ImageSpec(*size, sum(map(len, channels.values())), "float")
-        spec.channelnames = tuple(one for names in channels.values() for one in names)
-        spec.channelformats = tuple(self.formats[name] for name, names in channels.items() for _ in names)
-        spec.attribute("compression", "zip")
-        spec.attribute("DateTime", "")  # without it the time of day goes into every file
-        for name, value in attributes.items():
-            name = _OIIO_NAMES.get(name, name)
-            if isinstance(value, np.ndarray):
-                spec.attribute(name, _TYPES[value.shape], tuple(np.float32(value).ravel().tolist()))
-            else:
-                spec.attribute(name, plain(value))
-        output: Any = oiio.ImageOutput.create("exr")
-        is_written = output is not None and output.open(native_name(path), spec)
-        step = max(BLOCK // (size[0] * spec.nchannels) // LINES, 1) * LINES
-        for start in range(0, size[1], step):
-            stop = min(start + step, size[1])
-            is_written = is_written and output.write_scanlines(start, stop, 0, self.block(start, stop))
-        problem = one_line(oiio.geterror() if output is None else output.geterror())
-        if output is None or not output.close() or not is_written or problem:
-            raise OSError(f"cannot write {path}: {problem or 'unknown failure'}")
+        planes = {
+            channel: self._plane(channel, self.formats[name], size)
+            for name, channels in self.channels.items()
+            for channel in channels
+        }
+        write_channels(path, planes, attributes)
 
 
 def bands_of(scheduler: FrameScheduler, index: int, previous_index: int) -> Iterator[BandFrame]:
@@ -210,6 +189,9 @@ def render_in_bands(
         if rows.picture:
             write_png(path.with_suffix(".png"), np.concatenate(rows.picture), output.exposure)
         if part is not None:
-            rows.write(part, written_attributes(frame, output.precision), frame.camera.resolution)
+            try:
+                rows.write(part, written_attributes(frame, output.precision), frame.camera.resolution)
+            except OSError as error:
+                raise OSError(str(error).replace(str(part), str(path))) from error
         frame.timings["write"] += time.perf_counter() - started
     return frame

@@ -102,8 +102,6 @@ def write_exr(
     ``precision`` is "half" or "float" for the buffers that may be either.
     Raises OSError when the file cannot be written, OptionError for buffers of unequal size.
     """
-    import OpenEXR
-
     if precision not in ("half", "float"):
         raise OptionError(f"EXR precision must be 'half' or 'float', got {precision!r}")
     channels: dict[str, np.ndarray] = {}
@@ -122,6 +120,13 @@ def write_exr(
         channels |= dict(zip(channel_names(buffer, len(planes)), planes, strict=True))
     if not channels:
         raise OptionError("an EXR file needs at least one buffer")
+    write_channels(path, channels, attributes)
+
+
+def write_channels(path: str | Path, channels: Mapping[str, np.ndarray], attributes: Mapping[str, Attribute]) -> None:
+    """Write channels, float16 or float32 [height, width] by name, and ``attributes`` to ``path``; see ``write_exr``."""
+    import OpenEXR
+
     header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     for name, value in attributes.items():
         is_matrix = isinstance(value, np.ndarray)
@@ -130,7 +135,7 @@ def write_exr(
     with _writing:
         try:
             OpenEXR.set_global_thread_count(threads if threads > 1 else 0)
-            with OpenEXR.File(header, channels) as file:
+            with OpenEXR.File(header, dict(channels)) as file:
                 file.write(native_name(path))
         except RuntimeError as error:
             raise OSError(f"cannot write {path}: {one_line(str(error), 'unknown failure')}") from error
