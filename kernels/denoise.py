@@ -27,7 +27,7 @@ SMALLEST = wp.constant(wp.float32(1.0e-20))  # keeps quotients finite
 MOST_LIGHT = wp.constant(wp.float32(1.0e15))  # more, or what is no number, is no light
 LARGEST_EXPONENT = wp.constant(wp.float32(12.0))  # of a tap's weight: what is farther off counts nothing
 LEAST_AROUND = wp.constant(wp.float32(8.0))  # pixels around, fewer of which tell no outlier
-LEAST_KNOWN = wp.constant(wp.float32(128.0))  # frames of all pixels around, fewer of which know no mean square
+LEAST_KNOWN = wp.constant(wp.float32(256.0))  # frames of all pixels around, fewer of which know no mean square
 LEAST_WEIGHT = wp.constant(wp.float32(1.0e-2))  # of history: less is a neighbour's light, which a pixel hardly touches
 
 

@@ -13,6 +13,7 @@ from warp_gi.files import replacing
 from warp_gi.sequence import lock
 from warp_gi.sequence.lock import Claim
 from warp_gi.sequence.preview import write_png
+from warp_gi.techniques.shared.exr_parts import Part, write_exr_parts
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -56,3 +57,24 @@ def test_a_claim_that_finds_no_room_leaves_nothing(tmp_path, monkeypatch, writte
         claim.take()
     assert caught.value.filename == str(tmp_path) and not list(tmp_path.iterdir())
     claim.release()
+
+
+@pytest.mark.skipif(lock.fcntl is None, reason="this system has no limits of files")
+@pytest.mark.parametrize("count", [1, 2])
+def test_the_last_bytes_of_parts_that_find_no_room_are_told(tmp_path, count):
+    """OpenImageIO says that all is well when a file cannot grow by what it writes when it closes it."""
+    import resource
+
+    noise = np.random.default_rng(1).random((40, 64, 3), np.float32)
+    file = tmp_path / "a.exr"
+    parts = [Part(name, ("R", "G", "B"), (64, 40), lambda: noise) for name in "ab"[:count]]
+    write_exr_parts(file, file, parts)
+    size, limits = file.stat().st_size, resource.getrlimit(resource.RLIMIT_FSIZE)
+    for missing in (1, 10, 100, 1000):
+        file.unlink()
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size - missing, limits[1]))
+        try:
+            with pytest.raises(OSError, match="cannot write"):
+                write_exr_parts(file, file, parts)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)

@@ -55,9 +55,33 @@ def write_exr_parts(file: Path, path: Path, parts: Sequence[Part], attributes: d
             done = done and output.open(str(file), spec, "AppendSubimage")
         done = done and output.write_image(np.ascontiguousarray(part.pixels()))
     done = output.close() and done
-    if not done or output.has_error:
-        problem = reason(output, "unknown failure")
+    problem = "" if done and not output.has_error else reason(output, "unknown failure")
+    problem = problem or _end_missing(file)
+    if problem:
         raise OSError(f"cannot write {path}: {problem.replace(str(file), str(path))}")
+
+
+def _end_missing(file: Path) -> str:
+    """Return what is wrong with the last row of a part that was just written, or "": a full disk may fail at the end.
+
+    OpenImageIO does not tell when the last bytes, which it writes when it closes a file, find no room.
+    """
+    source = open_image(file)
+    if source is None:
+        return reason(None, "the disk may be full")
+    try:
+        part = 0
+        while source.seek_subimage(part, 0):
+            spec = source.spec()
+            end = spec.y + spec.height
+            if source.read_scanlines(part, 0, end - 1, end, 0, 0, spec.nchannels, "float") is None or source.has_error:
+                reason(source)
+                return "its last rows are not there; the disk may be full"
+            part += 1
+        reason(source)  # some readers keep that there was no further part
+    finally:
+        source.close()
+    return ""
 
 
 def read_exr_parts(path: str | Path) -> tuple[dict[str, dict[str, np.ndarray]], dict[str, str]]:
