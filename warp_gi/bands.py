@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from warp_gi.pipeline import Pipeline
     from warp_gi.scene.baked import BakedScene
     from warp_gi.scene.scene import Scene
+    from warp_gi.scheduler import FrameScheduler
 
 SHARE = 0.5
 """Share of the free memory that a band takes, where nobody says how much it may."""
@@ -60,11 +61,11 @@ class BandFrame(Frame):
         width = self.camera.resolution[0]
         launch.launch(kernel, len(self.rows) * width, inputs, self.device, first=self.rows.start * width)
 
-    def launch_tiled(self, kernel: wp.Kernel, inputs: Sequence[object]) -> None:
+    def launch_tiled(self, kernel: wp.Kernel, inputs: Sequence[object], share: int = 1) -> None:
         """Run a kernel over every pixel of the rows in tiles."""
-        each = math.ceil(self.camera.resolution[0] / TILE) * int(TILE**2)
-        count = math.ceil(len(self.rows) / TILE) * each
-        launch.launch(kernel, count, inputs, self.device, first=self.rows.start // int(TILE) * each)
+        each = math.ceil(self.camera.resolution[0] / TILE) * int(TILE**2) // share
+        count, least = math.ceil(len(self.rows) / TILE) * each, max(launch.SMALLEST_SLICE // share, 1)
+        launch.launch(kernel, count, inputs, self.device, least, first=self.rows.start // int(TILE) * each)
 
 
 def band_rows(
@@ -112,10 +113,14 @@ def why_whole(pipeline: Pipeline, scene: Scene | BakedScene) -> str:
     return f"{past[0]} depends on the frames before" if past else ""
 
 
-def check_whole(rows: int, resolution: tuple[int, int]) -> None:
-    """Raise OptionError for a picture of which only so many rows may be rendered at once."""
-    if rows < resolution[1]:
+def check_whole(scheduler: FrameScheduler) -> None:
+    """Raise OptionError for a picture of which only some rows may be rendered at once; the camera may be another one."""
+    resolution = scheduler.camera.resolution
+    if scheduler.rows < resolution[1]:
+        where = scheduler.scene, resolution, scheduler.device, scheduler.memory
+        scheduler.rows = band_rows(scheduler.pipeline, *where)
+    if scheduler.rows < resolution[1]:
         raise OptionError(
-            f"{too_large(resolution, False)}, more than it may; give an output: files are written in bands of {rows}"
-            " rows"
+            f"{too_large(resolution, False)}, more than it may; give an output: files are written in bands of"
+            f" {scheduler.rows} rows"
         )

@@ -319,9 +319,10 @@ class Frame:
         tiles = [math.ceil(size / gbuffer.TILE) for size in self.camera.resolution]
         return tiles[0] * tiles[1] * gbuffer.TILE**2
 
-    def launch_tiled(self, kernel: wp.Kernel, inputs: Sequence[object]) -> None:
-        """Run a kernel over every pixel in tiles (``kernels.gbuffer.tiled_pixel``)."""
-        self.launch(kernel, inputs, self.tiled_items)
+    def launch_tiled(self, kernel: wp.Kernel, inputs: Sequence[object], share: int = 1) -> None:
+        """Run a kernel over every pixel in tiles (``kernels.gbuffer.tiled_pixel``), ``share`` pixels in each item."""
+        least = max(launch.SMALLEST_SLICE // share, 1)
+        launch.launch(kernel, self.tiled_items // share, inputs, self.device, least)
 
     def trace_paths(self) -> None:
         """Trace the terms that estimators asked for in this camera sample, in one launch (``PathRequest``)."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from warp_gi import launch
 from warp_gi.kernels import camera_rays, gbuffer, layers
 from warp_gi.layers import has_layers
 from warp_gi.scene.baked import whole_scene
@@ -45,7 +44,7 @@ class CameraRays(Primary):
         settings, cameras = frame.pass_settings, [frame.camera_data, frame.previous_camera_data]
         share = camera_rays.PACKET if frame.device.is_cpu else 1
         inputs: list[object] = [frame.data, frame.camera_data, settings, share, frame.hits]
-        launch.launch(camera_rays.trace_primary, frame.tiled_items // share, inputs, frame.device, camera_rays.PACKET)
+        frame.launch_tiled(camera_rays.trace_primary, inputs, share)
         buffers = frame.struct(gbuffer.SurfaceBuffers)
         inputs = [frame.layer_data, *cameras, settings, frame.hits, buffers]
         if has_layers(frame.data):
