@@ -114,7 +114,7 @@ def why_whole(pipeline: Pipeline, scene: Scene | BakedScene) -> str:
 
 
 def check_whole(scheduler: FrameScheduler) -> None:
-    """Raise OptionError for a picture of which only some rows may be rendered at once; the camera may be another one."""
+    """Raise OptionError for a picture of which only some rows may be rendered at once. The camera may have changed."""
     resolution = scheduler.camera.resolution
     if scheduler.rows < resolution[1]:
         where = scheduler.scene, resolution, scheduler.device, scheduler.memory
