@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from warp_gi.pipeline import Pipeline
     from warp_gi.scene.baked import BakedScene
     from warp_gi.scene.scene import Scene
-    from warp_gi.scheduler import FrameScheduler
 
 SHARE = 0.5
 """Share of the free memory that a band takes, where nobody says how much it may."""
@@ -113,14 +112,23 @@ def why_whole(pipeline: Pipeline, scene: Scene | BakedScene) -> str:
     return f"{past[0]} depends on the frames before" if past else ""
 
 
-def check_whole(scheduler: FrameScheduler) -> None:
-    """Raise OptionError for a picture of which only some rows may be rendered at once. The camera may have changed."""
-    resolution = scheduler.camera.resolution
-    if scheduler.rows < resolution[1]:
-        where = scheduler.scene, resolution, scheduler.device, scheduler.memory
-        scheduler.rows = band_rows(scheduler.pipeline, *where)
-    if scheduler.rows < resolution[1]:
+def whole(
+    rows: int,
+    pipeline: Pipeline,
+    scene: Scene | BakedScene,
+    resolution: tuple[int, int],
+    device: wp.Device,
+    memory: float | None,
+) -> int:
+    """Return the number of rows that are rendered at once, ``rows`` where those are enough for the whole picture.
+
+    Raises OptionError where they are not, and what ``band_rows`` says of the picture are not, either.
+    """
+    if rows < resolution[1]:  # the camera may be another one
+        rows = band_rows(pipeline, scene, resolution, device, memory)
+    if rows < resolution[1]:
         raise OptionError(
-            f"{too_large(resolution, False)}, more than it may; give an output: files are written in bands of"
-            f" {scheduler.rows} rows"
+            f"{too_large(resolution, False)}, more than it may; give an output: files are written in bands of {rows}"
+            " rows"
         )
+    return rows

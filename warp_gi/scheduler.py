@@ -220,7 +220,7 @@ class FrameScheduler:
 
         A frame that an exception interrupts leaves nothing behind: what is rendered next is as if it had not begun.
         """
-        bands.check_whole(self)
+        self.rows = bands.whole(self.rows, self.pipeline, self.scene, self.camera.resolution, self.device, self.memory)
         index, began, timings = int(index), time.perf_counter(), {"bake": 0.0, "compile": 0.0}
         with timed(timings, "scene", self.device):
             self.scene.check_unchanged()
