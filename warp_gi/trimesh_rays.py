@@ -138,26 +138,24 @@ def _walk(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return rays, triangles and distances of up to ``most`` hits a ray: each query begins behind the hit before."""
     rays, begin, end = _cut(origins, ways, box)
-    last, step = np.full(len(rays), -np.inf), np.full(len(rays), STEP)
-    count = np.zeros(len(rays), np.int64)
+    last, count = np.full(len(rays), -np.inf), np.zeros(len(rays), np.int64)
     found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     while len(rays) and most > 0:
         starts = origins[rays] + ways[rays] * begin[:, None]
         hits = tree.intersect(starts.astype(np.float32), ways[rays].astype(np.float32))
         faces = hits.face.numpy().astype(np.int64)
         hit = np.flatnonzero(faces >= 0)
-        rays, begin, end, last, step, count, faces = (one[hit] for one in (rays, begin, end, last, step, count, faces))
+        rays, begin, end, last, count, faces = (one[hit] for one in (rays, begin, end, last, count, faces))
         near = begin + hits.t.numpy()[hit]
         t = _distances(corners[faces], origins[rays], ways[rays], near)
         is_new = (t > last + 0.5 * STEP) & (t >= -BEHIND)
         found.append((rays[is_new], faces[is_new], t[is_new]))
         # a hit that was counted already, or is behind the origin: float32 put the start of the query before it
-        step = np.where(is_new, STEP, 2.0 * step)
-        begin = np.where(is_new, t, np.maximum(begin, near)) + step
+        begin = np.where(is_new, t, near) + STEP
         last = np.where(is_new, t, last)
         count += is_new
         goes_on = (count < most) & (begin < end)
-        rays, begin, end, last, step, count = (one[goes_on] for one in (rays, begin, end, last, step, count))
+        rays, begin, end, last, count = (one[goes_on] for one in (rays, begin, end, last, count))
     if not found:
         return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
     every_ray, every_face, every_t = (np.concatenate(column) for column in zip(*found, strict=True))
@@ -168,12 +166,10 @@ def _cut(origins: np.ndarray, ways: np.ndarray, box: np.ndarray) -> tuple[np.nda
     """Return the rays that reach the box around 0, and where in it they begin and end."""
     with np.errstate(all="ignore"):
         sides = np.stack([(-box - origins) / ways, (box - origins) / ways])
-    is_along = ways == 0.0
-    is_inside = np.abs(origins) <= box
-    near = np.where(is_along, np.where(is_inside, -np.inf, np.inf), sides.min(axis=0)).max(axis=1)
-    far = np.where(is_along, np.inf, sides.max(axis=0)).min(axis=1)
+    near, far = sides.min(axis=0).max(axis=1), sides.max(axis=0).min(axis=1)
     begin = np.maximum(near, -STEP)
-    rays = np.flatnonzero(begin < far)  # none of a ray that is not finite
+    # nan, and no ray, where a number is not finite or the ray runs in a side of the box, which has a margin
+    rays = np.flatnonzero(begin < far)
     return rays, begin[rays], far[rays]
 
 

@@ -104,6 +104,9 @@ def test_edits_copies_and_bad_rays():
     for shapes in (((2, 3), (1, 3)), ((3,), (3,)), ((2, 2), (2, 2))):
         with pytest.raises(ValueError, match=r"shape \[ray, 3\]"):
             box.ray.intersects_first(np.zeros(shapes[0]), np.ones(shapes[1]))
+    loose = np.concatenate([box.vertices, [(np.nan, 0, 0), (1e30, 0, 0)]])[::-1]  # vertices of no triangle
+    loose = with_rays(trimesh.Trimesh(loose, len(loose) - 1 - box.faces, process=False))
+    np.testing.assert_array_equal(loose.ray.intersects_first(inside, inside), box.ray.intersects_first(inside, inside))
     assert gi.RayMeshIntersector(trimesh.Trimesh()).intersects_first(*ray).tolist() == [-1]
 
 
