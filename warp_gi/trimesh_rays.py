@@ -100,19 +100,21 @@ class RayMeshIntersector:
         return contains_points(self, points)
 
     @caching.cache_decorator
-    def _tree(self) -> tuple[np.ndarray, float, np.ndarray, np.ndarray, TriangleBvh]:
-        """Centre and scale of the mesh, triangles in the tree's units, float64 [triangle, 3, 3], box, tree."""
+    def _tree(self) -> tuple[np.ndarray, float, tuple[np.ndarray, np.ndarray], np.ndarray, TriangleBvh]:
+        """Centre and scale of the mesh; in the tree's units first corners and unit normals, box, tree."""
         corners = np.array(self.mesh.triangles, np.float64)
         low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
         size = float((high - low).max())
         scale = 2.0 ** np.ceil(np.log2(size)) if size > 0 else 1.0
         centre = 0.5 * (low + high)
         corners = (corners - centre) / scale
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         points = (np.asarray(self.mesh.vertices, np.float64) - centre) / scale
         used = np.unique(self.mesh.faces)  # a vertex of no triangle may be anywhere
         faces = np.searchsorted(used, self.mesh.faces).astype(np.int32)
         tree = TriangleBvh(points[used].astype(np.float32), faces, self._given[1], quality=self._given[2])
-        return centre, scale, corners, 0.5 * (high - low) / scale + MARGIN, tree
+        return centre, scale, (corners[:, 0].copy(), normals), 0.5 * (high - low) / scale + MARGIN, tree
 
     def _hits(self, origins: Any, directions: Any, most: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return triangles, rays and locations of up to ``most`` hits a ray, by ray and distance."""
@@ -124,21 +126,27 @@ class RayMeshIntersector:
         if len(self.mesh.faces) == 0 or len(starts) == 0:
             return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3))
         with np.errstate(all="ignore"):
-            ways /= np.abs(ways).max(axis=1, keepdims=True)
-            ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-        centre, scale, corners, box, tree = self._tree
-        rays, faces, t = _walk(tree, corners, box, (starts - centre) / scale, ways, most)
+            ways /= np.maximum(np.maximum(*np.abs(ways.T[:2])), np.abs(ways.T[2]))[:, None]  # no square overflows
+            ways /= np.sqrt(np.einsum("ij,ij->i", ways, ways))[:, None]
+        centre, scale, planes, box, tree = self._tree
+        rays, faces, t = _walk(tree, planes, box, (starts - centre) / scale, ways, most)
         order = np.lexsort((t, rays))
         rays, faces = rays[order], faces[order]
         return faces, rays, starts[rays] + ways[rays] * (t[order] * scale)[:, None]
 
 
 def _walk(
-    tree: TriangleBvh, corners: np.ndarray, box: np.ndarray, origins: np.ndarray, ways: np.ndarray, most: int
+    tree: TriangleBvh,
+    planes: tuple[np.ndarray, np.ndarray],
+    box: np.ndarray,
+    origins: np.ndarray,
+    ways: np.ndarray,
+    most: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return rays, triangles and distances of up to ``most`` hits a ray: each query begins behind the hit before."""
     rays, begin, end = _cut(origins, ways, box)
-    last, count = np.full(len(rays), -np.inf), np.zeros(len(rays), np.int64)
+    last: np.ndarray = np.full(len(rays), -np.inf)
+    count: np.ndarray = np.zeros(len(rays), np.int64)
     found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     while len(rays) and most > 0:
         starts = origins[rays] + ways[rays] * begin[:, None]
@@ -147,7 +155,7 @@ def _walk(
         hit = np.flatnonzero(faces >= 0)
         rays, begin, end, last, count, faces = (one[hit] for one in (rays, begin, end, last, count, faces))
         near = begin + hits.t.numpy()[hit]
-        t = _distances(corners[faces], origins[rays], ways[rays], near)
+        t = _distances(planes[0][faces] - origins[rays], planes[1][faces], ways[rays], near)
         is_new = (t > last + 0.5 * STEP) & (t >= -BEHIND)
         found.append((rays[is_new], faces[is_new], t[is_new]))
         # a hit that was counted already, or is behind the origin: float32 put the start of the query before it
@@ -166,19 +174,21 @@ def _cut(origins: np.ndarray, ways: np.ndarray, box: np.ndarray) -> tuple[np.nda
     """Return the rays that reach the box around 0, and where in it they begin and end."""
     with np.errstate(all="ignore"):
         sides = np.stack([(-box - origins) / ways, (box - origins) / ways])
-    near, far = sides.min(axis=0).max(axis=1), sides.max(axis=0).min(axis=1)
+    (x, y, z), (a, b, c) = np.minimum(*sides).T, np.maximum(*sides).T
+    near, far = np.maximum(np.maximum(x, y), z), np.minimum(np.minimum(a, b), c)
     begin = np.maximum(near, -STEP)
     # nan, and no ray, where a number is not finite or the ray runs in a side of the box, which has a margin
     rays = np.flatnonzero(begin < far)
     return rays, begin[rays], far[rays]
 
 
-def _distances(corners: np.ndarray, origins: np.ndarray, ways: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Return the distances to the planes of triangles [hit, 3, 3]; ``near``, those of the tree, where edge-on."""
-    first = corners[:, 0]
-    normals = np.cross(corners[:, 1] - first, corners[:, 2] - first)
-    across = (ways * normals).sum(axis=1)
+def _distances(first: np.ndarray, normals: np.ndarray, ways: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Return distances to planes, by a point of each, counted from the ray's origin, and its unit normal.
+
+    They are ``near``, those of the tree, where a triangle is edge-on.
+    """
+    across = np.einsum("ij,ij->i", ways, normals)
     with np.errstate(all="ignore"):
-        t = ((first - origins) * normals).sum(axis=1) / across
-        most = ROUNDING * np.maximum(np.linalg.norm(normals, axis=1) / np.abs(across), 10.0)
+        t = np.einsum("ij,ij->i", first, normals) / across
+        most = ROUNDING * np.maximum(1.0 / np.abs(across), 10.0)
     return np.where(np.isfinite(t) & (np.abs(t - near) <= most), t, near)
