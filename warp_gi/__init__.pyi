@@ -10,6 +10,8 @@ from warp_gi.baking import load_bake as load_bake
 from warp_gi.bvh import AlphaMasks as AlphaMasks
 from warp_gi.bvh import Hits as Hits
 from warp_gi.bvh import TriangleBvh as TriangleBvh
+from warp_gi.camera_rays import CameraHits as CameraHits
+from warp_gi.camera_rays import trace_cameras as trace_cameras
 from warp_gi.denoise import Denoiser as Denoiser
 from warp_gi.denoise import Oidn as Oidn
 from warp_gi.denoise import SpatioTemporal as SpatioTemporal
@@ -67,6 +69,7 @@ from warp_gi.techniques.reuse.sample_octree import SampleOctree as SampleOctree
 from warp_gi.techniques.surface_cache.cache import SurfaceCache as SurfaceCache
 from warp_gi.techniques.visibility_field.estimator import VisibilityField as VisibilityField
 from warp_gi.techniques.visibility_polygons.estimator import VisibilityPolygons as VisibilityPolygons
+from warp_gi.trimesh_rays import RayMeshIntersector as RayMeshIntersector
 from warp_gi.verbosity import set_verbosity as set_verbosity
 
 __version__: str

@@ -136,6 +136,16 @@ class TriangleBvh:
             return self.data.nodes.capacity + self.data.blocks.capacity + self.data.parents.capacity
         return 3 * 32 * self.triangle_count  # wp.Mesh: two binary nodes and the bounds of each triangle
 
+    @property
+    def points(self) -> np.ndarray:
+        """Vertex positions in metres as of the last refit, float32 [vertex, 3], on the host; only to read."""
+        return self._positions.numpy()
+
+    @property
+    def indices(self) -> np.ndarray:
+        """Vertices of each triangle, int32 [triangle, 3], on the host; only to read."""
+        return self._indices.numpy()
+
     def set_alpha(self, alpha: AlphaMasks | None) -> None:
         """Replace the triangles with holes; None is none. Raises SceneError for masks that do not fit the triangles."""
         self._alpha = alpha

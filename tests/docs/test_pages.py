@@ -8,7 +8,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
 
 import warp_gi as gi
 from warp_gi import registry
@@ -155,6 +157,29 @@ def test_examples_of_edits_run(number, size, tmp_path, monkeypatch, capsys):
     else:
         assert "(0.63, 0.065, 0.05)" in capsys.readouterr().out
         assert found["wall"].base_color == pytest.approx(found["wanted"], rel=1e-3)
+
+
+@pytest.mark.parametrize("number", range(7))
+def test_examples_of_ray_queries_run(number, tmp_path, monkeypatch, capsys):
+    text = blocks(DOCS / "guide/ray_queries.md", "python")[number]
+    monkeypatch.setattr(trimesh.ray.ray_triangle, "RayMeshIntersector", trimesh.ray.ray_triangle.RayMeshIntersector)
+    if trimesh.ray.has_embree:
+        embree = trimesh.ray.ray_pyembree
+        monkeypatch.setattr(embree, "RayMeshIntersector", embree.RayMeshIntersector)
+    (tmp_path / "example.py").write_text(text, encoding="utf-8")  # Warp reads kernels from files
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "example", raising=False)
+    found = vars(importlib.import_module("example"))
+    said = re.findall(r"^print.*  # ([\[(<].*)$", text, re.MULTILINE)
+    assert capsys.readouterr().out.splitlines()[: len(said)] == said
+    if number == 0:
+        np.testing.assert_allclose(found["at"], [[0.75, 0.25, 0.0], [0.25, 0.75, 0.0]])
+    elif number == 1:
+        assert found["face"].tolist() == [0, -1]
+    elif number == 2:
+        np.testing.assert_allclose(found["seen"].depth[:, 24, 32], np.linspace(2, 4, 100), rtol=1e-6)
+    elif number == 3:
+        assert found["t"] == found["again"] == 1.5
 
 
 def run(text):
