@@ -172,7 +172,7 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
 sys.exit(main([*{BAKE!r}, "--quiet", "-o", {str(path)!r}]))
 """
     result = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
-    assert result.returncode == 2 and result.stderr.count("\n") == 1 and str(path) in result.stderr, result
+    assert result.returncode == 1 and result.stderr.count("\n") == 1 and str(path) in result.stderr, result
     assert [p.name for p in tmp_path.iterdir()] == [path.name] and path.read_bytes() == b"old"
 
 

@@ -203,9 +203,9 @@ def test_relighting_a_still_camera_traces_nothing_and_is_exact(monkeypatch):
     traced = []
     launch_tiled = gi.Frame.launch_tiled
 
-    def watched(self, kernel, inputs):
+    def watched(self, kernel, *arguments):
         traced.append(kernel)
-        launch_tiled(self, kernel, inputs)
+        launch_tiled(self, kernel, *arguments)
 
     monkeypatch.setattr(gi.Frame, "launch_tiled", watched)
     scene.environment = smooth_sky(120.0)
