@@ -146,7 +146,7 @@ def box_corners(node: Node) -> np.ndarray:
 def swept_box(nodes: Sequence[Node], moving: Sequence[bool], evenly: np.ndarray) -> np.ndarray:
     """Return a box around the poses of moving meshes that keep their shape: low and high corner, float64 [2, 3].
 
-    The poses are those at the keys of whatever moves together, and at the times ``evenly`` [s].
+    The poses are those at the keys of whatever moves a mesh, and at the times ``evenly`` [s].
     """
     rest, top = world_matrices(nodes, 0.0), list(range(len(nodes)))
     groups: dict[int, list[int]] = {}
@@ -157,26 +157,68 @@ def swept_box(nodes: Sequence[Node], moving: Sequence[bool], evenly: np.ndarray)
             groups.setdefault(top[index], []).append(index)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for group in groups.values():
-        if any(nodes[index].meshes and _is_rigid(nodes[index]) for index in group):
-            times = np.union1d(evenly, key_times([nodes[index] for index in group]))
-            step = max(POSES_AT_ONCE // len(group), 16)
-            for start in range(0, len(times), step):
-                box = _group_box(nodes, group, rest, times[start : start + step])
-                low, high = np.minimum(low, box[0]), np.maximum(high, box[1])
+        if any(_is_placed(nodes[index]) for index in group):
+            for some, placed, times in _cheapest(nodes, group, evenly):
+                step = max(POSES_AT_ONCE // len(some), 16)
+                for start in range(0, len(times), step):
+                    box = _group_box(nodes, some, placed, rest, times[start : start + step])
+                    low, high = np.minimum(low, box[0]), np.maximum(high, box[1])
     return np.stack([low, high])
 
 
-def _group_box(nodes: Sequence[Node], group: list[int], rest: list[np.ndarray], times: np.ndarray) -> np.ndarray:
-    """Return a box around all meshes of a group of nodes at all ``times`` [s]; ``rest`` places what does not move."""
+_Work = tuple[list[int], list[int], np.ndarray]
+"""Nodes whose matrices are needed, those of them whose meshes are asked for, and the times [s]."""
+
+
+def _cheapest(nodes: Sequence[Node], group: list[int], evenly: np.ndarray) -> list[_Work]:
+    """Return how to go through the poses of a group that moves together: at once, or by what has keys above a mesh.
+
+    Nodes with keys of their own under one that moves have times of their own; in a chain, all move the last one.
+    """
+    times = {index: np.array([key.time for key in nodes[index].keyframes or ()]) for index in group}
+    above: dict[int, list[int]] = {}
+    classes: dict[tuple[int, ...], list[int]] = {}
+    for index in group:
+        parent = nodes[index].parent
+        above[index] = [*above.get(-1 if parent is None else parent, ()), index]
+        if _is_placed(nodes[index]):
+            classes.setdefault(tuple(one for one in above[index] if nodes[one].keyframes), []).append(index)
+
+    def at(keyed: Sequence[int]) -> np.ndarray:
+        return np.unique(np.concatenate([evenly, *(times[one] for one in keyed)]))
+
+    whole: _Work = group, [index for index in group if _is_placed(nodes[index])], at(group)
+    parts: list[_Work] = []
+    cost = 0
+    for keyed, members in classes.items():
+        needed = sorted({one for index in members for one in above[index]})
+        parts.append((needed, members, at(keyed)))
+        cost += len(needed) * len(parts[-1][2])
+        if cost > len(group) * len(whole[2]):
+            return [whole]
+    return parts
+
+
+def _group_box(
+    nodes: Sequence[Node], group: list[int], placed: list[int], rest: list[np.ndarray], times: np.ndarray
+) -> np.ndarray:
+    """Return a box around the meshes of the nodes ``placed`` of a group at all ``times`` [s].
+
+    ``rest`` places what does not move.
+    """
     world = world_at_times(nodes, group, times, rest)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for index in group:
-        node = nodes[index]
-        if _is_rigid(node) and any(len(mesh.points) for mesh in node.meshes):
-            matrices = world[index].reshape(-1, 4, 4)
-            points = np.matmul(box_corners(node), matrices[:, :3, :3].transpose(0, 2, 1)) + matrices[:, None, :3, 3]
-            low, high = np.minimum(low, points.min(axis=(0, 1))), np.maximum(high, points.max(axis=(0, 1)))
+    for index in placed:
+        matrices = world[index].reshape(-1, 4, 4)
+        corners = box_corners(nodes[index])
+        points = np.matmul(corners, matrices[:, :3, :3].transpose(0, 2, 1)) + matrices[:, None, :3, 3]
+        low, high = np.minimum(low, points.min(axis=(0, 1))), np.maximum(high, points.max(axis=(0, 1)))
     return np.stack([low, high])
+
+
+def _is_placed(node: Node) -> bool:
+    """Return whether a node has meshes that keep their shape."""
+    return _is_rigid(node) and any(len(mesh.points) for mesh in node.meshes)
 
 
 def _is_rigid(node: Node) -> bool:

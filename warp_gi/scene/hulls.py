@@ -59,15 +59,57 @@ class Hull:
         """
         if not len(self.which):
             return np.stack([np.full(3, np.inf), np.full(3, -np.inf)])
+        if weights is None:
+            return self._still_box(placed)
         ends = np.broadcast_to(self.ends, (len(placed), *self.ends.shape))
-        if weights is not None:
-            for k, shift in enumerate(self.shifts):
-                ends = ends + np.sort(weights[:, k, None, None, None] * shift, axis=2)
+        for k, shift in enumerate(self.shifts):
+            ends = ends + np.sort(weights[:, k, None, None, None] * shift, axis=2)
         middle, half = ends.mean(axis=2), (ends[:, :, 1] - ends[:, :, 0]) / 2
         matrices = placed[:, self.which]
         middle = np.einsum("tjik,tjk->tji", matrices[..., :3, :3], middle) + matrices[..., :3, 3]
         half = np.einsum("tjik,tjk->tji", np.abs(matrices[..., :3, :3]), half)
         return np.stack([(middle - half).min(axis=(0, 1)), (middle + half).max(axis=(0, 1))])
+
+    def _still_box(self, placed: np.ndarray) -> np.ndarray:
+        """Return ``box`` without targets. A joint's boxes are looked at one by one only where all in one reach out."""
+        joints, first, joint_of = np.unique(self.which, return_index=True, return_inverse=True)
+        ends = self.ends[first]
+        np.minimum.at(ends[:, 0], joint_of, self.ends[:, 0])
+        np.maximum.at(ends[:, 1], joint_of, self.ends[:, 1])
+        joint = np.tile(np.arange(len(joints)), len(placed))
+        matrices = placed[:, joints].reshape(-1, 4, 4)
+        outer = _turned_boxes(matrices, ends[joint])
+        if len(joints) == len(self.which):
+            return np.stack([outer[:, 0].min(axis=0), outer[:, 1].max(axis=0)])
+        rows = [np.flatnonzero(joint_of == one) for one in range(len(joints))]
+
+        def inner(chosen: np.ndarray) -> np.ndarray:
+            boxes = [
+                _turned_boxes(
+                    np.repeat(matrices[some], len(rows[one]), axis=0), np.tile(self.ends[rows[one]], (len(some), 1, 1))
+                )
+                for one in np.unique(joint[chosen])
+                for some in [chosen[joint[chosen] == one]]
+            ]
+            return _union([np.stack([one[:, 0].min(axis=0), one[:, 1].max(axis=0)]) for one in boxes])
+
+        found = inner(np.concatenate([outer[:, 0].argmin(axis=0), outer[:, 1].argmax(axis=0)]))
+        beyond = (outer[:, 0] < found[0]).any(axis=1) | (outer[:, 1] > found[1]).any(axis=1)
+        return _union([found, inner(np.flatnonzero(beyond))])
+
+
+def _turned_boxes(matrices: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Return boxes around the boxes ``ends`` [n, 2, 3], each placed by its matrix [n, 4, 4], float64 [n, 2, 3]."""
+    middle, half = ends.mean(axis=1), (ends[:, 1] - ends[:, 0]) / 2
+    turned = np.einsum("nik,nk->ni", matrices[:, :3, :3], middle) + matrices[:, :3, 3]
+    reach = np.einsum("nik,nk->ni", np.abs(matrices[:, :3, :3]), half)
+    return np.stack([turned - reach, turned + reach], axis=1)
+
+
+def _together(hulls: Sequence[Hull]) -> Hull:
+    """Return all boxes of some hulls without targets as one hull, in which a joint may have several."""
+    which = np.concatenate([hull.which for hull in hulls])
+    return Hull(which, np.concatenate([hull.ends for hull in hulls]), np.zeros((0, len(which), 2, 3)))
 
 
 Hulls = Mapping[int, Sequence[Hull]]
@@ -109,6 +151,8 @@ def swept_box(nodes: Sequence[Node], hulls: Hulls, evenly: np.ndarray) -> np.nda
         leaders = members if skin is None else skin.joints
         above = _with_parents(nodes, leaders)
         keys = animation.key_times([nodes[index] for index in {*above, *members}])
+        still = [hull for index in members if nodes[index].morphs is None for hull in hulls[index]]
+        alike = [_together(still)] if still else []
         times = np.union1d(evenly, keys)
         step = max(POSES_AT_ONCE // len(above), 16)
         for start in range(0, len(times), step):
@@ -118,10 +162,12 @@ def swept_box(nodes: Sequence[Node], hulls: Hulls, evenly: np.ndarray) -> np.nda
             placed = np.stack([np.broadcast_to(world[index], shape) for index in leaders], axis=1)
             if skin is not None:
                 placed = placed @ np.asarray(skin.joint_from_mesh, np.float64)
+            boxes += [hull.box(placed, None) for hull in alike]
             for index in members:
                 morphs = nodes[index].morphs
-                weights = None if morphs is None else morph_weights(morphs, some)
-                boxes += [hull.box(placed, weights) for hull in hulls[index]]
+                if morphs is not None:
+                    weights = morph_weights(morphs, some)
+                    boxes += [hull.box(placed, weights) for hull in hulls[index]]
     return _union(boxes)
 
 

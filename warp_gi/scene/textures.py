@@ -63,6 +63,9 @@ def check_material(material: Material) -> None:
     owner = f"material {material.name!r}"
 
     def within(label: str, values: object, low: float, high: float) -> None:
+        plain = values if isinstance(values, tuple) else (values,)
+        if all(type(value) is float and low <= value <= high for value in plain):
+            return  # without NumPy, which takes five times as long for one number
         array = np.asarray(values, np.float64)
         if not np.all((array >= low) & (array <= high)):
             raise SceneError(f"{owner}: {label} must be from {low:g} to {high:g}, got {values}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -30,7 +31,7 @@ class SceneParts:
 
     def middle(self) -> np.ndarray:
         """Return a point that half of the triangles lie before along each axis, float64 [3], at time 0."""
-        places, _, counts = self._boxes()
+        places, _, counts = self._boxes
         if not len(places):
             return np.zeros(3)
         order = np.argsort(places, axis=0, kind="stable")
@@ -39,11 +40,12 @@ class SceneParts:
 
     def bounds(self) -> np.ndarray:
         """Return the lowest and highest corner around the boxes of all meshes, float64 [2, 3], at time 0."""
-        middles, halves, _ = self._boxes()
+        middles, halves, _ = self._boxes
         if not len(middles):
             return np.zeros((2, 3))
         return np.stack([(middles - halves).min(axis=0), (middles + halves).max(axis=0)])
 
+    @cached_property
     def _boxes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return middle and half size of each placed mesh's box, float64 [n, 3], and its triangles [n], at time 0.
 
