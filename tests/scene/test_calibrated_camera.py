@@ -207,6 +207,10 @@ def test_transforms_of_instant_ngp(tmp_path):
 def test_distortion_is_left_out_with_a_line(tmp_path):
     with pytest.warns(UserWarning, match=r"lens distortion \(k1, p2\) is not modelled"):
         CameraPath.load(write(tmp_path / "t.json", {**NERF, "k1": 0.1, "k2": 0.0, "p2": -0.01}))
+    with pytest.warns(UserWarning, match=r"lens distortion \(k5, k6\) is not modelled"):
+        CameraPath.load(write(tmp_path / "t.json", {**NERF, "k5": 0.1, "k6": 0.2}))
+    with pytest.warns(UserWarning, match="rolling_shutter is not modelled"):
+        CameraPath.load(write(tmp_path / "t.json", {**NERF, "rolling_shutter": [0, 0, 0.1]}))
 
 
 @pytest.mark.parametrize(
@@ -220,7 +224,8 @@ def test_distortion_is_left_out_with_a_line(tmp_path):
             "is 9x32",
         ),
         ({"frames": [{"file_path": "a.png"}]}, "'transform_matrix' is missing"),
-        ({"frames": [{"transform_matrix": REFLECTED.tolist()}]}, "reflection"),
+        ({"frames": [{"transform_matrix": REFLECTED.tolist()}]}, "t.json: frame 0: world_from_camera is a reflection"),
+        ({"frames": [*NERF["frames"], {**NERF["frames"][0], "fl_x": -5}]}, "t.json: frame 2: K must be"),
     ],
 )
 def test_transforms_that_cannot_be_used(tmp_path, change, words):

@@ -195,6 +195,61 @@ def test_statements_that_are_not_read_are_named(line, feature, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("alpha", "mtl", "is_told"),
+    [
+        (0, "map_Kd c.png", True),
+        (255, "map_Kd c.png", False),
+        (0, "map_Kd c.png\nmap_d c.png", False),
+        (0, "map_Kd c.png\nd 0.5", False),  # which the alpha of the map counts for, too
+    ],
+)
+def test_holes_in_a_colour_map_that_no_coverage_names_are_told(alpha, mtl, is_told, tmp_path):
+    pixels = np.full((4, 4, 4), 255, np.uint8)
+    pixels[0, :, 3] = alpha
+    (tmp_path / "c.png").write_bytes(png(pixels))
+    text = f"mtllib a.mtl\n{SQUARE}vt 0 0\nusemtl m\nf 1/1 2/1 3/1 4/1\n"
+    _, told = load(tmp_path, text, f"newmtl m\nKd 1 1 1\n{mtl}\n")
+    assert ["alpha of map_Kd without map_d (material 'm'), which is ignored: opaque" in one for one in told] == (
+        [True] * is_told
+    )
+
+
+@pytest.mark.parametrize(("line", "words"), [("map_Kd", "map_Kd, line 3"), ("\tnorm ", "norm, line 3")])
+def test_maps_without_a_file_are_told(line, words, tmp_path):
+    _, (told,) = material(tmp_path, f"Kd 1 1 1\n{line}\n")
+    assert f"maps of MTL without a file ({words} of 'a.mtl'), which is ignored" in told
+
+
+def test_a_factor_on_a_normal_map_is_told(tmp_path):
+    (tmp_path / "c.png").write_bytes(png(np.full((2, 2, 3), 128, np.uint8)))
+    text = f"mtllib a.mtl\n{SQUARE}vt 0 0\nusemtl m\nf 1/1 2/1 3/1 4/1\n"
+    for factor, is_told in (("0.5", True), ("1", False)):
+        _, told = load(tmp_path, text, f"newmtl m\nKd 1 1 1\nnorm -bm {factor} c.png\n")
+        assert ["-bm 0.5 of norm of material 'm'" in one for one in told] == [True] * is_told
+
+
+def test_numbers_of_a_vertex_past_its_colour_are_told(tmp_path):
+    scene, (told,) = load(tmp_path, "v 0 0 0 1 0 0\nv 1 0 0 0 1 0 0.5\nv 0 1 0 0 0 1\nf 1 2 3\n")
+    assert "more than six numbers of a vertex (line 2), which is ignored" in told
+    np.testing.assert_array_equal(scene.nodes[0].meshes[0].colors, np.eye(3))
+
+
+@pytest.mark.parametrize("options", [{"scale": 0.5}, {"up": "z"}, {"scale": 0.5, "up": "z", "recentre": True}])
+def test_keyframes_move_a_scaled_and_turned_file_in_metres(options, tmp_path):
+    """Files without a hierarchy have scale and axis in their points, so that keyframes do not undo them."""
+    (tmp_path / "a.obj").write_text("v 10 0 0\nv 12 0 0\nv 10 2 6\nvn 0 0 1\nf 1//1 2//1 3//1\n")
+    scene = gi.load_scene(tmp_path / "a.obj", **options)
+    rest, scale = scene.bounds + scene.offset, options.get("scale", 1.0)
+    corner = scale * np.array([[10, 0, 0], [12, 2, 6]])
+    if "up" in options:
+        corner = np.array([[10, 0, -2], [12, 6, 0]]) * scale
+        np.testing.assert_array_equal(scene._flat.normals, [[0, 1, 0]] * 3)
+    np.testing.assert_allclose(rest, corner, atol=1e-6)
+    scene.animate(scene.nodes[0].name, [gi.Keyframe(0.0, (7.0, 0.0, 0.0))])
+    np.testing.assert_allclose(scene.bounds + scene.offset, rest + np.array([7, 0, 0]), atol=1e-5)
+
+
+@pytest.mark.parametrize(
     ("color", "expected"),
     [("255 0 51", (1.0, 0.0, 0.2)), ("127.5 0 0", (0.5, 0.0, 0.0)), ("1.5 0 0.2", (1.0, 0.0, 0.2))],
 )
@@ -300,3 +355,18 @@ def test_alpha_of_vertex_colours_is_coverage(kind, alpha, expected, tmp_path):
     scene = gi.load_scene(tmp_path / "a.ply")
     assert scene.materials[0].alpha_blend == (expected < 1.0)
     np.testing.assert_allclose(scene.nodes[0].meshes[0].colors[:, 3], expected, rtol=1e-6)
+
+
+def test_other_elements_of_ply_are_told(tmp_path):
+    element = b"element material 1\nproperty uchar red\nend_header\n"
+    whole = ply().replace(b"end_header\n", element) + b"255\n"
+    (tmp_path / "a.ply").write_bytes(whole)
+    with pytest.warns(gi.UnsupportedWarning, match=r"other elements of PLY, such as material \(element 'material'\)"):
+        gi.load_scene(tmp_path / "a.ply")
+
+
+def test_a_ply_without_triangles_tells_what_it_has(tmp_path):
+    (tmp_path / "a.ply").write_bytes(ply().replace(b"element face", b"element faces"))
+    expected = r"holds no triangles \(its elements: 3 of 'vertex', 1 of 'faces'\); export it with faces"
+    with pytest.warns(gi.UnsupportedWarning, match="faces"), pytest.raises(gi.SceneError, match=expected):
+        gi.load_scene(tmp_path / "a.ply")

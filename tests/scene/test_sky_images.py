@@ -3,7 +3,9 @@
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from PIL import Image
 
+from warp_gi.color import SRGB_TO_LINEAR
 from warp_gi.errors import SceneError
 from warp_gi.scene.environment import Environment
 from warp_gi.scene.sky_motion import SkySequence
@@ -289,3 +291,57 @@ def test_a_data_window_that_is_too_large(tmp_path):
     file = write(tmp_path / "sky.exr", [(spec, np.zeros((1, 17_000, 3), np.float32))])
     with pytest.raises(SceneError, match="data window is 17000x1, at most 16384 a side"):
         Environment.load(file)
+
+
+def with_runs(values):
+    """Return RGBE bytes in the coding of before 1991: a pixel 1, 1, 1, n is n more of the one before."""
+    flat = np.frombuffer(rgbe(values), np.uint8).reshape(-1, 4)
+    coded, at = [], 0
+    while at < len(flat):
+        end = at
+        while end < len(flat) and (flat[end] == flat[at]).all():
+            end += 1
+        coded.append(flat[at].tobytes())
+        more = end - at - 1
+        while more:
+            coded.append(bytes((1, 1, 1, more % 256)))
+            more //= 256
+        at = end
+    return b"".join(coded)
+
+
+@pytest.mark.parametrize("runs", [1, 5, 64, 700])
+def test_the_first_run_length_coding_of_radiance(tmp_path, runs):
+    width, height = 64, 32
+    values = EXACT.reshape(-1, 3)[: max(width * height // runs, 1)]
+    values = np.resize(np.repeat(values, runs, axis=0), (height, width, 3))
+    head = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=2\n\n-Y {height} +X {width}\n".encode()
+    path = tmp_path / "sky.hdr"
+    path.write_bytes(head + with_runs(values))
+    assert np.array_equal(Environment.load(path).pixels, np.float32(values / 2))
+    path.write_bytes(head + with_runs(values)[:-9])
+    with pytest.raises(SceneError, match="damaged or cut short"):
+        Environment.load(path)
+
+
+def test_whole_numbers_are_ids_and_no_light(tmp_path):
+    spec = oiio.ImageSpec(WIDTH, HEIGHT, 3, "uint")
+    spec.channelnames = ("R", "G", "B")
+    path = write(tmp_path / "sky.exr", [(spec, (picture() * 9).astype(np.uint32))])
+    with pytest.raises(SceneError, match="the channels of RGB are whole numbers, as ids are; expected half or float"):
+        Environment.load(path)
+
+
+def test_ids_beside_colors_leave_them_linear(tmp_path):
+    spec = spec_of(["R", "G", "B", "id"])
+    spec.channelformats = ("half", "half", "half", "uint")
+    pixels = np.dstack([picture(), np.full((HEIGHT, WIDTH), 7.0, np.float32)])
+    loaded = Environment.load(write(tmp_path / "sky.exr", [(spec, pixels)])).pixels
+    np.testing.assert_allclose(loaded, picture(), rtol=1e-3)
+
+
+def test_pictures_of_webp(tmp_path):
+    colors = np.zeros((8, 16, 3), np.uint8)
+    colors[:4], colors[4:] = (200, 100, 50), (20, 40, 80)
+    Image.fromarray(colors).save(tmp_path / "sky.webp", lossless=True)
+    np.testing.assert_allclose(Environment.load(tmp_path / "sky.webp").pixels, SRGB_TO_LINEAR[colors], atol=1e-6)

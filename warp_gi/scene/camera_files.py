@@ -7,6 +7,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,7 +21,7 @@ Vec3 = tuple[float, float, float]
 
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 """Camera models of COLMAP that are pinholes, once the distortion is left out."""
-DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 RESOLUTION = (960, 540)
 LARGEST = 1e300
 """Magnitude above which a number of a file is a mistake."""
@@ -145,9 +146,18 @@ def _keyframes(document: Mapping[str, Any]) -> CameraFile:
             raise ValueError(
                 f"{key.what} has K and the path no resolution; give resolution, the width and height in pixels of K"
             )
-    cameras = [_camera(key, size) for key in keys]
+    cameras = [_named(key, partial(_camera, key, size)) for key in keys]
     times = [key.number("time", 0.0) for key in keys]
     return CameraFile(cameras, times, path.number("fps", 24.0), [_look(key) if "eye" in key else None for key in keys])
+
+
+def _named(values: _Fields, make: Callable[[], T]) -> T:
+    """Return what ``make`` does; errors about a camera without a name say which one it is."""
+    try:
+        return make()
+    except ValueError as error:
+        text = str(error).removeprefix("camera '': ").removeprefix("camera ")
+        raise ValueError(text if values.what in text else f"{values.what}: {text}") from error
 
 
 def _camera(key: _Fields, resolution: tuple[int, int]) -> Camera:
@@ -157,7 +167,7 @@ def _camera(key: _Fields, resolution: tuple[int, int]) -> Camera:
         warnings.warn(
             f"{key.what} of a camera path has {', '.join(map(repr, unknown))}, which nothing reads; known are"
             f" {', '.join(sorted(KEYFRAME_FIELDS))}",
-            stacklevel=7,
+            stacklevel=8,
         )
     beside = [name for name in LENS_FIELDS if name in key]
     if "K" in key and beside:
@@ -198,6 +208,7 @@ def _transforms(document: Mapping[str, Any], path: Path) -> CameraFile:
     cameras: list[Camera] = []
     sizes: list[tuple[int, int]] = []
     distorted: set[str] = set()
+    is_rolling = False
     frames = _Fields(document, "the file").objects("frames", "frame")
     if not frames:
         raise ValueError("expected frames, found none")
@@ -212,6 +223,7 @@ def _transforms(document: Mapping[str, Any], path: Path) -> CameraFile:
             (w, h), (width, height) = sizes[-1], sizes[0]
             raise ValueError(f"{frame.what} is {w}x{h}, the first {width}x{height}; make a file for each size")
         cameras.append(_transforms_camera(values, sizes[0]))
+        is_rolling = is_rolling or bool(np.any(np.asarray(values.values.get("rolling_shutter", 0)) != 0))
     if distorted:
         names = ", ".join(sorted(distorted))
         warnings.warn(
@@ -219,6 +231,8 @@ def _transforms(document: Mapping[str, Any], path: Path) -> CameraFile:
             " compare with",
             stacklevel=6,
         )
+    if is_rolling:
+        warnings.warn(f"camera path {path}: rolling_shutter is not modelled and left out", stacklevel=6)
     return CameraFile(cameras)
 
 
@@ -243,7 +257,8 @@ def _transforms_camera(values: _Fields, resolution: tuple[int, int]) -> Camera:
     if "fl_y" not in values and "camera_angle_y" in values and "h" in values:
         fy = _focal_length(values, "camera_angle_y", height)
     K = [[fx, 0.0, values.number("cx", width / 2)], [0.0, fy, values.number("cy", height / 2)], [0.0, 0.0, 1.0]]
-    return Camera.from_intrinsics(K, values.matrix("transform_matrix"), resolution, "opengl")
+    placement = values.matrix("transform_matrix")
+    return _named(values, partial(Camera.from_intrinsics, K, placement, resolution, "opengl"))
 
 
 def _focal_length(values: _Fields, name: str, side: int) -> float:

@@ -55,7 +55,9 @@ def load_scene(
         environment: A path to a sky map, an RGB radiance, an Environment, a SunSky, or None for black.
         smooth: Crease angle in degrees. Meshes without normals get smooth ones except across
             edges that bend more than this; None leaves them flat, as glTF asks.
-        scale: Metres in one unit of the file. Radiance and intensities are left as they are.
+        scale: Metres in one unit of the file. Radiance and intensities are left as they are. Where a file has points
+            alone, as OBJ and PLY, these are scaled and turned (``up``): keyframes for ``Scene.animate`` move them in
+            metres. Nodes of glTF have it in their placement, which keyframes replace.
         recentre: Whether to take the middle of the scene, in whole units, from all positions in double precision.
             ``Scene.offset`` is what was taken: nodes, bounds and the buffer "position" are without it. Cameras, and
             keyframes for ``Scene.animate``, are still given in the file's coordinates. None does so, with a warning,

@@ -23,7 +23,9 @@ def transform_points(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def transform_normals(matrix: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Return unit normals [n, 3] moved by ``matrix``, float32; those without a direction become zero."""
-    (a, b, c), (d, e, f), (g, h, i) = matrix[:3, :3].tolist()  # np.cross takes ten times as long
+    (a, b, c), (d, e, f), (g, h, i) = np.asarray(matrix, np.float64)[
+        :3, :3
+    ].tolist()  # np.cross takes ten times as long
     cofactors = np.array(
         [
             [e * i - f * h, f * g - d * i, d * h - e * g],

@@ -25,6 +25,8 @@ from warp_gi.scene.files.support import BY_NAME
 from warp_gi.scene.model import Node, PunctualLight
 from warp_gi.scene.pinhole import Camera
 
+DRAWN = ("mesh", "skin", "weights")
+"""Fields of a node that a hidden one has not; its light is left out, too."""
 MOST_NODES = 1_000_000  # instances are nodes, too
 CAMERA_HEIGHT = 540  # pixels; a glTF camera has a shape but no resolution
 
@@ -77,6 +79,7 @@ class _Reader:
         pending: list[tuple[int, int | None, str]] = [(index, None, "the scene") for index in reversed(self._roots())]
         numbers: dict[int, int] = {}
         bent: list[tuple[Node, Bones, str]] = []
+        hidden: set[int] = set()
         while pending:
             index, parent, owner = pending.pop()
             source = self.document.item("nodes", index, owner)
@@ -84,6 +87,9 @@ class _Reader:
                 raise SceneError(f"{str(self.path)!r}: node {index} hangs on two parents or on itself")
             numbers[index] = len(nodes)
             owner = self.document.name("nodes", index)
+            if parent in hidden or self._is_hidden(source, owner):
+                hidden.add(len(nodes))
+                source = {key: value for key, value in source.items() if key not in DRAWN}
             children = self.document.indices(source, "children", owner)
             pending.extend((child, len(nodes), owner) for child in reversed(children))
             sources.append((source, owner))
@@ -96,7 +102,14 @@ class _Reader:
             sources += [({}, owner)] * len(copies)
         for node, bones, owner in bent:
             node.skin = bones.placed(self.document, numbers, owner)
-        return self._with_lights_and_cameras(nodes, sources)
+        return self._with_lights_and_cameras(nodes, sources, hidden)
+
+    def _is_hidden(self, source: Part, owner: str) -> bool:
+        """Return whether KHR_node_visibility hides a node, with all below it; its joints and cameras are there."""
+        shown = (self.document.extension(source, "KHR_node_visibility", owner) or {}).get("visible", True)
+        if not isinstance(shown, bool):
+            raise self.document.error(owner, f"visible of KHR_node_visibility must be true or false, got {shown!r:.60}")
+        return not shown
 
     def _bones(self, source: Part, owner: str) -> Bones | None:
         """Return the skin of a node's meshes, or None."""
@@ -128,7 +141,12 @@ class _Reader:
             self.document.findings.add("instances of meshes with a skin", owner)
             return []
         given = self.document.part(extension, "attributes", owner) or {}
+        if not given:
+            raise self.document.error(owner, "EXT_mesh_gpu_instancing lacks attributes; export it without")
         widths = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}
+        for name in given:
+            if name not in widths and ("COLOR" in name or not name.startswith("_")):
+                self.document.findings.add("other attributes of instances", f"{name} of {owner}")
         for name in (name for name in widths if given.get(name) is not None):
             number = self.document.whole(self.document.item("accessors", given[name], owner), "count", owner)
             if index + number >= MOST_NODES:
@@ -140,6 +158,9 @@ class _Reader:
             for name, width in widths.items()
             if given.get(name) is not None
         }
+        turns = values.get("ROTATION")
+        if turns is not None and not turns.any(axis=1).all():
+            raise self.document.error(owner, f"rotation of instance {int(np.argmin(turns.any(axis=1)))} is zeros")
         counts = {len(one) for one in values.values()}
         if len(counts) > 1:
             raise self.document.error(owner, f"its instances have {' and '.join(map(str, sorted(counts)))} values")
@@ -160,7 +181,14 @@ class _Reader:
                     " the matrix counts"
                 )
             values = self.document.numbers(source, "matrix", owner, (0.0,) * 16)
-            return np.array(values, np.float64).reshape(4, 4).T
+            matrix = np.array(values, np.float64).reshape(4, 4).T
+            if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), rtol=0.0, atol=1e-6):
+                self.document.findings.lost.append(
+                    f"{str(self.document.path)!r}: the last row of the matrix of {owner} must be 0 0 0 1, got"
+                    f" {matrix[3].tolist()}; it counts as if it were"
+                )
+            matrix[3] = (0.0, 0.0, 0.0, 1.0)
+            return matrix
         rest = {"translation": (0.0,) * 3, "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0,) * 3}
         if not rest.keys() & source.keys():
             return np.eye(4)
@@ -182,7 +210,9 @@ class _Reader:
         }
         return [index for index in range(len(nodes)) if index not in children]
 
-    def _with_lights_and_cameras(self, nodes: list[Node], sources: list[tuple[Part, str]]) -> SceneParts:
+    def _with_lights_and_cameras(
+        self, nodes: list[Node], sources: list[tuple[Part, str]], hidden: set[int]
+    ) -> SceneParts:
         document = self.document
         parts = SceneParts(nodes, findings=document.findings)
         moving, world = moving_nodes(nodes), world_matrices(nodes, 0.0)
@@ -191,7 +221,7 @@ class _Reader:
         names = _Names()
         for index, (source, owner) in enumerate(sources):
             extension = document.extension(source, "KHR_lights_punctual", owner)
-            if extension is not None:
+            if extension is not None and index not in hidden:
                 number = document.whole(extension, "light", owner)
                 if number >= len(described):
                     raise document.error(owner, f"names light {number}, and the file has {len(described)} lights")
@@ -222,6 +252,10 @@ class _Reader:
                 raise OptionError(f"{what} has neither a perspective nor an orthographic lens")
             aspect = document.number(lens, "aspectRatio", what, 16.0 / 9.0)
             vfov = document.number(lens, "yfov", what)
+            if not 0.0 < vfov < math.pi:
+                raise OptionError(f"{what} must have a yfov between 0 and pi radians, got {vfov:g}")
+            if not aspect > 0.0:
+                raise OptionError(f"{what} must have an aspectRatio above 0, got {aspect:g}")
             hfov = 2.0 * math.degrees(math.atan(math.tan(vfov / 2.0) * aspect))
             is_free = lens.get("aspectRatio") is None
             return Camera(world_from_node, hfov, _shape(aspect), name, keeps_vertical=is_free)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warp_gi.scene.animation import slerp
+from warp_gi.scene.animation import slerp, turned_quaternion
 from warp_gi.scene.files.gltf_buffers import Buffers
 from warp_gi.scene.files.gltf_document import Document, Part
 from warp_gi.scene.model import Keyframe, MorphKeyframe
@@ -78,7 +78,10 @@ def read_animations(document: Document, buffers: Buffers) -> Animations:
         for channel in document.objects(animation, "channels", name):
             target = document.part(channel, "target", name) or {}
             path = target.get("path")
-            if target.get("node") is None or not isinstance(path, str) or path not in (*WIDTHS, WEIGHTS):
+            if target.get("node") is None or path == "pointer":
+                continue  # what extensions aim at
+            if not isinstance(path, str) or path not in (*WIDTHS, WEIGHTS):
+                document.findings.add("animation of other properties", f"{path!r:.40} of {name}")
                 continue
             node = document.whole(target, "node", name)
             document.item("nodes", node, name)
@@ -136,6 +139,18 @@ def _morphs(channel: _Channel) -> list[MorphKeyframe]:
     return [MorphKeyframe(time, tuple(row)) for time, row in zip(times.tolist(), values.tolist(), strict=True)]
 
 
+def _taken_apart(placed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return translation, rotation (x, y, z, w) and scale of a matrix [3, 4]; shear is lost."""
+    linear = placed[:, :3]
+    scale = np.linalg.norm(linear, axis=0)
+    if np.linalg.det(linear) < 0.0:
+        scale[0] = -scale[0]
+    axes = np.divide(linear, scale, out=np.eye(3), where=np.abs(scale) > 0.0)
+    left, _, right = np.linalg.svd(axes)  # the nearest rotation
+    turn = left @ np.diag((1.0, 1.0, np.linalg.det(left @ right))) @ right
+    return placed[:, 3], np.array(turned_quaternion(turn, (0.0, 0.0, 0.0, 1.0))), scale
+
+
 def _merge(document: Document, index: int, channels: dict[str, _Channel]) -> list[Keyframe]:
     """Return keyframes at all times of the node's channels; a property without one keeps its value at rest."""
     node, owner = document.items("nodes")[index], document.name("nodes", index)
@@ -144,6 +159,13 @@ def _merge(document: Document, index: int, channels: dict[str, _Channel]) -> lis
         "rotation": np.array(document.numbers(node, "rotation", owner, (0.0, 0.0, 0.0, 1.0))),
         "scale": np.array(document.numbers(node, "scale", owner, (1.0, 1.0, 1.0))),
     }
+    if node.get("matrix") is not None:
+        matrix = np.array(document.numbers(node, "matrix", owner, (0.0,) * 16)).reshape(4, 4).T
+        rest.update(zip(rest, _taken_apart(matrix[:3]), strict=True))
+        document.findings.lost.append(
+            f"{str(document.path)!r}: {owner} is animated and has a matrix, where it should have translation, rotation"
+            " and scale; they are taken from it"
+        )
     times = np.unique(np.concatenate([channel.key_times() for channel in channels.values()]))
     poses = {
         path: channels[path].values_at(times) if path in channels else np.tile(value, (len(times), 1))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import binascii
+import os
+import re
 import struct
 import urllib.parse
 from pathlib import Path
@@ -11,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from warp_gi.errors import SceneError
-from warp_gi.scene.files.gltf_compressed import MESHOPT, meshopt_view
+from warp_gi.scene.files.gltf_compressed import MESHOPT, is_installed, meshopt_view
 from warp_gi.scene.files.gltf_document import Document, Part
-from warp_gi.scene.files.images import find_file
+from warp_gi.scene.files.images import OutsideError, find_file
 
 COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -49,13 +51,44 @@ def split_glb(data: memoryview, path: Path) -> tuple[bytes, memoryview | None]:
     return text, binary
 
 
-def decode_data_uri(uri: str) -> bytes:
-    """Return the bytes of a ``data:`` URI; raises SceneError."""
-    header, _, payload = uri.partition(",")
+def is_data_uri(uri: str) -> bool:
+    """Return whether a URI holds its data itself."""
+    return uri[:5].lower() == "data:"
+
+
+def decode_data_uri(uri: str, what: str) -> bytes:
+    """Return the bytes of a ``data:`` URI (RFC 2397), of either alphabet of base64; raises SceneError about ``what``.
+
+    Names of schemes and codings are those of any case, and base64 may be percent-encoded, in lines, or not padded.
+    """
+    header, comma, payload = uri.partition(",")
+    if not comma:
+        raise SceneError(f"{what}: its data URI ({header[:40]}) is damaged: it has no comma before its data")
+    if not re.search(r";\s*base64\s*$", header, re.IGNORECASE):
+        return urllib.parse.unquote_to_bytes(payload)
+    if "%" in payload:
+        payload = urllib.parse.unquote(payload)
+    if any(one in payload for one in " \t\r\n"):
+        payload = "".join(payload.split())
+    payload = payload.rstrip("=")
     try:
-        return base64.b64decode(payload) if header.endswith(";base64") else urllib.parse.unquote_to_bytes(payload)
+        coded = payload.encode("ascii").translate(bytes.maketrans(b"-_", b"+/"))
+        return base64.b64decode(coded + b"=" * (-len(coded) % 4), validate=True)
     except (binascii.Error, ValueError) as error:
-        raise SceneError(f"a data URI ({header[:40]}) is damaged: {error}") from error
+        raise SceneError(f"{what}: its data URI ({header[:40]}) is damaged ({error}); export it again") from error
+
+
+def find_uri(folder: Path, uri: str, what: str) -> Path:
+    """Return the file of a relative URI, which writers encode or do not; raises SceneError if it is missing."""
+    try:
+        return find_file(folder, urllib.parse.unquote(uri), what)
+    except OutsideError:
+        raise
+    except SceneError:
+        for other in dict.fromkeys((uri, urllib.parse.unquote(uri.partition("?")[0].partition("#")[0]))):
+            if other != urllib.parse.unquote(uri) and os.path.isfile(folder / other):
+                return find_file(folder, other, what)
+        raise
 
 
 class Buffers:
@@ -79,11 +112,10 @@ class Buffers:
                 data = self.binary
             elif not isinstance(uri, str):
                 raise self.document.error(f"buffer {index}", f"uri must be a text, got {uri!r:.60}")
-            elif uri.startswith("data:"):
-                data = memoryview(decode_data_uri(uri))
+            elif is_data_uri(uri):
+                data = memoryview(decode_data_uri(uri, f"{str(self.path)!r}: buffer {index}"))
             else:
-                name = urllib.parse.unquote(uri)
-                data = memoryview(find_file(self.path.parent, name, f"{str(self.path)!r}: buffer file").read_bytes())
+                data = memoryview(find_uri(self.path.parent, uri, f"{str(self.path)!r}: buffer file").read_bytes())
             if len(data) < length:
                 raise SceneError(
                     f"{str(self.path)!r}: buffer {index} is truncated: it should have {length} bytes"
@@ -97,12 +129,22 @@ class Buffers:
         view = self.document.item("bufferViews", index, owner)
         name = f"buffer view {index}"
         packed = self.document.extension(view, MESHOPT, name)
-        if packed is None:
+        if packed is None or self._has_fallback(view, name):
             return self._bytes(view, name)
         number = int(index)  # type: ignore[call-overload]
         if number not in self._decoded:
             self._decoded[number] = meshopt_view(self.document, self._bytes(packed, name), packed, name)
         return self._decoded[number]
+
+    def _has_fallback(self, view: Part, name: str) -> bool:
+        """Return whether a compressed view is there uncompressed, too, and no decoder is installed."""
+        document = self.document
+        if MESHOPT in document.listed_extensions("extensionsRequired") or is_installed(MESHOPT):
+            return False
+        number = document.whole(view, "buffer", name)
+        buffer = document.item("buffers", number, name)
+        marked = (document.extension(buffer, MESHOPT, f"buffer {number}") or {}).get("fallback")
+        return not marked and (buffer.get("uri") is not None or (number == 0 and self.binary is not None))
 
     def _bytes(self, view: Part, name: str) -> memoryview:
         start = self.document.whole(view, "byteOffset", name, 0)

@@ -37,6 +37,15 @@ def decoder(document: Document, extension: str) -> ModuleType:
         ) from error
 
 
+def is_installed(extension: str) -> bool:
+    """Return whether there is a decoder of an extension."""
+    try:
+        importlib.import_module(INSTALL[extension][0])
+    except (ImportError, OSError):
+        return False
+    return True
+
+
 def draco_attributes(document: Document, data: memoryview, names: Part, owner: str) -> dict[str, np.ndarray]:
     """Return the decoded attributes [vertex, width] by their glTF names, and "indices" [3 * triangle].
 

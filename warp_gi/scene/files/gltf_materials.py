@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import urllib.parse
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -10,12 +9,14 @@ import numpy as np
 
 from warp_gi.color import SRGB_TO_LINEAR, encode_srgb
 from warp_gi.errors import SceneError
-from warp_gi.scene.files.gltf_buffers import Buffers, decode_data_uri
+from warp_gi.scene.files.gltf_buffers import Buffers, decode_data_uri, find_uri, is_data_uri
 from warp_gi.scene.files.gltf_document import Document, Part
-from warp_gi.scene.files.images import find_file, read_image
+from warp_gi.scene.files.images import read_image
 from warp_gi.scene.model import Color, Material, Texture
 
 WRAP_MODES = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
+LEAST_AREA = 1e-12
+"""Determinant of a transform of coordinates below which others cannot be told from what it leaves."""
 NEAREST = 9728  # the one filter without interpolation between texels
 
 
@@ -119,17 +120,18 @@ class MaterialReader:
 
     def _coordinates(self, old: Part, surface: Part, source: Part, coat: Part, through: Part, what: str) -> Coordinates:
         """Return the coordinates of the first texture of a material; note a third set."""
-        places = [(old, "diffuseTexture"), (surface, "baseColorTexture"), (source, "emissiveTexture")]
-        places += [(source, "normalTexture"), (surface, "metallicRoughnessTexture"), (old, "specularGlossinessTexture")]
+        places = [(old, "diffuseTexture"), (old, "specularGlossinessTexture"), (surface, "baseColorTexture")]
+        places += [(source, "emissiveTexture"), (source, "normalTexture"), (surface, "metallicRoughnessTexture")]
         places += [(coat, "specularTexture"), (coat, "specularColorTexture"), (through, "transmissionTexture")]
         infos = [self.document.part(holder, key, what) for holder, key in places]
         found = [texture_transform(self.document, info, what) for info in infos if info is not None]
         if not found:
             return Coordinates()
-        others = dict.fromkeys(number for number, _ in found if number != found[0][0])
+        first = Coordinates(*found[0], needed=True)
+        others = dict.fromkeys(number for number, transform in found if not _reaches(first, number, transform))
         if len(others) > 1:
             self.document.findings.add("a third set of texture coordinates", what)
-        return Coordinates(*found[0], next(iter(others), None), needed=True)
+        return replace(first, further=next(iter(others), None))
 
     def _converted(self, material: Material, old: Part, slot: _Slots, what: str) -> Material:
         """Return a material with what KHR_materials_pbrSpecularGlossiness says of it.
@@ -149,9 +151,11 @@ class MaterialReader:
             roughness = 1.0
             rough = np.round(255.0 - gloss * both.pixels[..., 3]).astype(np.uint8)
             texture = replace(both, srgb=False, pixels=np.stack([rough, rough, np.zeros_like(rough), rough], axis=2))
-            darkened = darker(color, both, max(specular))
+            apart = _stands_elsewhere(both, color)
+            if apart:
+                document.findings.add("coordinates of specular-glossiness textures", what)
+            darkened = darker(color, both, max(specular), apart)
             color = replace(color, pixels=darkened) if color is not None else replace(both, pixels=darkened)
-            color = replace(color, uv_set=0, transform=None)
         return replace(
             material,
             base_color=(red * share, green * share, blue * share),
@@ -177,11 +181,11 @@ class MaterialReader:
         index = self.document.whole(info, "index", what)
         number, transform = texture_transform(self.document, info, what)
         relative: tuple[Color, Color] | None = None
-        further = number != coordinates.number
+        further = not _reaches(coordinates, number, transform)
         if further:
             relative = upward_rows(transform)
         elif not np.allclose(transform, coordinates.transform):
-            relative = upward_rows(transform @ np.linalg.pinv(coordinates.transform))
+            relative = upward_rows(transform @ np.linalg.inv(coordinates.transform))
         key = index, srgb, further, relative
         if key not in self._textures:
             self._textures[key] = replace(
@@ -202,7 +206,7 @@ class MaterialReader:
             nearest = sampler.get("magFilter") == NEAREST
         image = document.item("images", source, f"texture {index}")
         name = document.text(texture, "name") or document.text(image, "name") or document.text(image, "uri")[:80]
-        if not name or name.startswith("data:"):
+        if not name or is_data_uri(name):
             name = f"image {source}"
         return Texture(name, self._pixels(source, name, material), srgb, wrap, nearest)
 
@@ -215,6 +219,11 @@ class MaterialReader:
         if texture.get("source") is None:
             if self.document.extension(texture, "KHR_texture_basisu", what) is not None:
                 raise self.document.error(what, "is a KTX2 image, which is not supported; export it as PNG or JPEG")
+            names = ", ".join(self.document.part(texture, "extensions", what) or {})
+            if names:
+                raise self.document.error(
+                    what, f"has its image in {names} alone, which is not supported; export it as PNG or JPEG"
+                )
             raise SceneError(f"{str(self.document.path)!r}: {what} has no image")
         return self.document.whole(texture, "source", what)
 
@@ -227,10 +236,10 @@ class MaterialReader:
                 source: Path | bytes | memoryview = self.buffers.view(image["bufferView"], f"image {index}")
             elif not uri:
                 raise SceneError(f"{what} has neither a file nor data")
-            elif uri.startswith("data:"):
-                source = decode_data_uri(uri)
+            elif is_data_uri(uri):
+                source = decode_data_uri(uri, what)
             else:
-                source = find_file(self.document.path.parent, urllib.parse.unquote(uri), what)
+                source = find_uri(self.document.path.parent, uri, what)
             self._images[index] = read_image(source, what)
         return self._images[index]
 
@@ -263,11 +272,18 @@ def _normal_reflectance(document: Document, extension: Part, what: str) -> float
     return 0.04 if ior == 1.5 else ((ior - 1.0) / (ior + 1.0)) ** 2
 
 
-def darker(color: Texture | None, both: Texture, most: float) -> np.ndarray:
-    """Return sRGB pixels of a diffuse texture times 1 - max(specular), at the size of the larger of the two."""
+def darker(color: Texture | None, both: Texture, most: float, evenly: bool = False) -> np.ndarray:
+    """Return sRGB pixels of a diffuse texture times 1 - max(specular), at the size of the larger of the two.
+
+    ``evenly`` takes the mean of the specular texture, which stands elsewhere.
+    """
     from PIL import Image
 
     base = np.full_like(both.pixels, 255) if color is None else color.pixels
+    if evenly:
+        specular = SRGB_TO_LINEAR[both.pixels[..., :3]].max(axis=2).mean(dtype=np.float64)
+        dark = encode_srgb(SRGB_TO_LINEAR[base[..., :3]] * (1.0 - most * specular))
+        return np.dstack([np.round(dark * 255.0).astype(np.uint8), base[..., 3]])
     size = max(base.shape[1], both.pixels.shape[1]), max(base.shape[0], both.pixels.shape[0])
 
     def resized(pixels: np.ndarray) -> np.ndarray:  # RGBA images would be weighted by their alpha
@@ -295,6 +311,14 @@ def texture_transform(document: Document, info: Part, what: str) -> tuple[int, n
     matrix = np.array([[c * su, s * sv, du], [-s * su, c * sv, dv], [0.0, 0.0, 1.0]])
     own = document.whole(info, "texCoord", what, 0)
     return document.whole(extension, "texCoord", what, own), matrix
+
+
+def _reaches(coordinates: Coordinates, number: int, transform: np.ndarray) -> bool:
+    """Return whether a texture's coordinates follow from those that a mesh has first, unless they are all one point."""
+    if number != coordinates.number:
+        return False
+    is_flat = abs(np.linalg.det(coordinates.transform)) < LEAST_AREA
+    return not is_flat or np.allclose(transform, coordinates.transform)
 
 
 def _stands_elsewhere(texture: Texture | None, base: Texture | None) -> bool:

@@ -42,6 +42,10 @@ class MeshReader:
         key = index, blend, id(bones)
         if key not in self._meshes:
             primitives = self.document.objects(source, "primitives", name)
+            if not primitives:
+                raise self.document.error(
+                    name, "primitives must list at least one" if "primitives" in source else "lacks primitives"
+                )
             label = self.document.text(source, "name") or name
             found = (self._primitive(one, name, label, blend, bones) for one in primitives)
             self._meshes[key] = [mesh for mesh in found if mesh is not None]
@@ -58,7 +62,9 @@ class MeshReader:
                 raise document.error(owner, f"mode must be from 0 to 6, got {mode!r:.60}")
             document.findings.add("points and lines", owner)
             return None
-        attributes = document.part(source, "attributes", owner) or {}
+        attributes = document.part(source, "attributes", owner)
+        if attributes is None:
+            raise document.error(owner, "a primitive of it lacks attributes")
         if attributes.get("POSITION") is None:
             document.findings.add("primitives without positions", owner)
             return None

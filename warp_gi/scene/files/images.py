@@ -98,7 +98,7 @@ def read_image(source: Path | bytes | memoryview, what: str) -> np.ndarray:
     16-bit images lose their low byte. Raises SceneError naming ``what`` if it is damaged, cut short or empty, and
     before its pixels are read if it has more than ``MOST_TEXELS`` or does not fit into memory.
     """
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     try:
         with warnings.catch_warnings():
@@ -131,6 +131,8 @@ def read_image(source: Path | bytes | memoryview, what: str) -> np.ndarray:
         zlib.error,
     ) as error:
         reason = one_line(error, type(error).__name__)  # readers of damaged files raise what they stumble over
+        if isinstance(error, UnidentifiedImageError):
+            reason = "it is in no format of images that is known"
         raise SceneError(f"{what} cannot be read as an image ({reason}); replace or repair it") from error
 
 

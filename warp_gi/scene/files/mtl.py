@@ -72,6 +72,8 @@ class MtlMaterial:
         if key in MAPS or key in MAP_FEATURES:
             if len(words) > 1:
                 self.maps[key] = words[1:]
+            else:
+                self.unread.append(("maps of MTL without a file", f"{words[0]}, {where}"))
         elif key in NUMBERS:
             words = uncommented(words)
             values = [_number(word) for word in words[1:] if key != "d" or word.lower() != "-halo"]
@@ -197,8 +199,8 @@ class MtlReader:
         for key in source.maps:
             if key in MAP_FEATURES:
                 self.findings.add(MAP_FEATURES[key], what)
-            for option in _further_options(source.maps[key]) if key in MAPS else ():
-                self.findings.add("other options of maps (-mm, -t, -cc, -imfchan)", f"{option} of {key} of {what}")
+            for option in _further_options(source.maps[key], key) if key in MAPS else ():
+                self.findings.add("other options of maps (-mm, -t, -cc, -imfchan, -bm)", f"{option} of {key} of {what}")
         for key, feature in NUMBER_FEATURES.items():
             if _first(source.numbers, key, 0.0) > 0.0:
                 self.findings.add(feature, what)
@@ -230,6 +232,8 @@ class MtlReader:
         color = self._texture(material, source, "map_kd", srgb=True)
         coverage = self._texture(material, source, "map_d", srgb=False)
         if coverage is None:
+            if color is not None and _coverage(source.numbers) == 1.0 and color.pixels[..., 3].min() < 255:
+                self.findings.add("alpha of map_Kd without map_d", f"material {material!r}")
             return color
         mask = coverage.pixels
         alpha = mask[..., 3] if mask[..., 3].min() < 255 else mask[..., :3].max(axis=2)
@@ -345,7 +349,7 @@ def _map_options(words: list[str]) -> tuple[str, str, np.ndarray]:
     return " ".join(words[at:]), wrap, transform
 
 
-def _further_options(words: list[str]) -> list[str]:
+def _further_options(words: list[str], key: str) -> list[str]:
     """Return the options of a map that change what it shows and are not read, such as "-mm 0.2 0.5"."""
     found = []
     for option, values in _options(words)[0]:
@@ -355,6 +359,7 @@ def _further_options(words: list[str]) -> list[str]:
             "-t": any(numbers),
             "-cc": values[:1] == ["on"],
             "-imfchan": True,
+            "-bm": key == "norm" and numbers != [1.0],
         }
         if changes.get(option, False):
             found.append(" ".join([option, *values]))

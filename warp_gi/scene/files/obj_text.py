@@ -221,6 +221,8 @@ def _vertices(lines: _Lines, path: object, findings: Findings) -> tuple[np.ndarr
     counts = _counts(text) if len(numbers) else np.zeros(1, np.int64)
     if counts.max() < 6:
         return _rows(lines, VERTEX, 3, path, "v"), None
+    if counts.max() > 6:
+        findings.add("more than six numbers of a vertex", f"line {lines.numbers[numbers[np.argmax(counts > 6)]]}")
     rows = _rows(lines, VERTEX, 6, path, "v", least=3)
     has = counts >= 6
     colors, scale = rows[:, 3:], 1.0

@@ -13,7 +13,7 @@ from warp_gi.scene.files.support import Findings
 from warp_gi.scene.model import Mesh, Node, PunctualLight
 from warp_gi.scene.normals import smooth_mesh
 from warp_gi.scene.pinhole import Camera
-from warp_gi.scene.poses import deforms, poses
+from warp_gi.scene.poses import deforms, poses, transform_normals
 
 
 @dataclass(eq=False)
@@ -70,19 +70,50 @@ class SceneParts:
         halves = np.einsum("nij,nj->ni", np.abs(placed[:, :3, :3]), (ends[:, 1] - ends[:, 0]) / 2)
         return middles, halves, np.array(counts)
 
-    def recentred(self, offset: np.ndarray) -> SceneParts:
-        """Return the parts with ``offset`` taken from all positions, in double precision."""
+    def _bare(self) -> set[int]:
+        """Return the nodes that stand where their points are, alone, as those of files without a hierarchy do."""
         parents = {node.parent for node in self.nodes}
         joints = {joint for node in self.nodes if node.skin is not None for joint in node.skin.joints}
+        return {
+            index
+            for index, node in enumerate(self.nodes)
+            if node.parent is None
+            and node.keyframes is None
+            and node.skin is None
+            and index not in parents
+            and index not in joints
+            and np.array_equal(node.parent_from_node, np.eye(4))
+        }
+
+    def _changed(self, linear: np.ndarray) -> dict[int, Node]:
+        """Return the bare nodes with ``linear`` [3, 3], on their points, where keyframes leave it."""
+        done: dict[int, Mesh] = {}
+
+        def changed_mesh(mesh: Mesh) -> Mesh:
+            if id(mesh) not in done:
+                points = (np.asarray(mesh.points, np.float64) @ linear.T).astype(np.float32)
+                normals = None if mesh.normals is None else transform_normals(linear, mesh.normals)
+                done[id(mesh)] = replace(mesh, points=points, normals=normals)
+            return done[id(mesh)]
+
+        found = {}
+        for index in self._bare():
+            node = self.nodes[index]
+            if not any(mesh.targets for mesh in node.meshes):
+                x, y, z = (linear @ np.array(node.pivot)).tolist()
+                found[index] = replace(node, meshes=[changed_mesh(mesh) for mesh in node.meshes], pivot=(x, y, z))
+        return found
+
+    def recentred(self, offset: np.ndarray) -> SceneParts:
+        """Return the parts with ``offset`` taken from all positions, in double precision."""
+        bare = self._bare()
         back = np.eye(4)
         back[:3, 3] = -offset
 
         def moved_node(index: int, node: Node) -> Node:
             if node.parent is not None:
                 return node
-            is_still = node.keyframes is None and np.array_equal(node.parent_from_node, np.eye(4))
-            is_bare = is_still and index not in parents and index not in joints and node.skin is None
-            if is_bare:  # its points may be doubles: they are moved before the cast
+            if index in bare:  # its points may be doubles: they are moved before the cast
                 x, y, z = (offset + node.pivot).tolist()
                 moved = [replace(mesh, points=mesh.points - offset) for mesh in node.meshes]
                 return replace(node, meshes=moved, pivot=(x, y, z))
@@ -116,10 +147,11 @@ class SceneParts:
     def scaled(self, scale: float) -> SceneParts:
         """Return the parts with all lengths times ``scale``; intensities stay as they are."""
         grow = np.diag([scale, scale, scale, 1.0])
+        bare = self._changed(grow[:3, :3])
 
-        def scaled_node(node: Node) -> Node:
-            if node.parent is not None:
-                return node
+        def scaled_node(index: int, node: Node) -> Node:
+            if index in bare or node.parent is not None:
+                return bare.get(index, node)
             keys = [
                 replace(k, translation=tuple(scale * np.array(k.translation)), scale=tuple(scale * np.array(k.scale)))
                 for k in node.keyframes or ()
@@ -136,7 +168,7 @@ class SceneParts:
             return replace(camera, world_from_camera=grow @ camera.world_from_camera, offset=offset, ortho_width=width)
 
         return SceneParts(
-            [scaled_node(node) for node in self.nodes],
+            [scaled_node(index, node) for index, node in enumerate(self.nodes)],
             [scaled_light(light) for light in self.lights],
             {name: scaled_camera(camera) for name, camera in self.cameras.items()},
             self.camera_nodes,
@@ -148,14 +180,15 @@ class SceneParts:
         """Return the parts turned about the origin by a rotation [3, 3]."""
         turn = np.eye(4)
         turn[:3, :3] = rotation
+        bare = self._changed(rotation)
 
         def turned_vector(vector: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
             x, y, z = (rotation @ np.array(vector)).tolist()
             return x, y, z
 
-        def turned_node(node: Node) -> Node:
-            if node.parent is not None:
-                return node
+        def turned_node(index: int, node: Node) -> Node:
+            if index in bare or node.parent is not None:
+                return bare.get(index, node)
             keys = [
                 replace(k, translation=turned_vector(k.translation), rotation=turned_quaternion(rotation, k.rotation))
                 for k in node.keyframes or ()
@@ -172,7 +205,7 @@ class SceneParts:
             return replace(camera, world_from_camera=matrix, offset=turned_vector(camera.offset))
 
         return SceneParts(
-            [turned_node(node) for node in self.nodes],
+            [turned_node(index, node) for index, node in enumerate(self.nodes)],
             [turned_light(light) for light in self.lights],
             {name: turned_camera(camera) for name, camera in self.cameras.items()},
             self.camera_nodes,

@@ -40,6 +40,8 @@ UV_NAMES = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"), ("texture_s", "t
 COLOR_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 LINE_END = re.compile(rb"\r\n|\n|\r")
 INDEX_NAMES = ("vertex_indices", "vertex_index")
+READ = ("vertex", "face", "tristrips")
+"""Elements that are read."""
 
 
 @dataclass
@@ -88,7 +90,8 @@ def read_ply(path: Path) -> SceneParts:
     corners, sizes = np.concatenate([corners, strips]), np.concatenate([sizes, np.full(len(strips) // 3, 3)])
     if not len(sizes):
         findings.warn(path, stacklevel=4)
-        raise SceneError(f"{str(path)!r} holds no triangles; export it with faces")
+        names = ", ".join(f"{element.count:,} of {element.name[:40]!r}" for element in elements)
+        raise SceneError(f"{str(path)!r} holds no triangles (its elements: {names}); export it with faces")
     mesh = _mesh(vertices, points, corners, sizes, path, findings)
     return SceneParts([Node(path.stem, [mesh])], findings=findings)
 
@@ -373,6 +376,8 @@ def _note(elements: list[Element], header: bytes, findings: Findings) -> None:
     for element in elements:
         if element.name == "edge" and element.count:
             findings.add("points and lines", "element 'edge'")
+        elif element.name not in READ and element.count:
+            findings.add("other elements of PLY, such as material", f"element {element.name[:40]!r}")
         elif element.name == "face" and any(set(names) <= element.values.keys() for names in COLOR_NAMES):
             findings.add("colours of faces")
     if b"TextureFile" in header or any("texcoord" in element.sizes for element in elements):

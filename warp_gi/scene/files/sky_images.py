@@ -126,7 +126,17 @@ def _read_pixels(path: Path, name: str, wanted: str, orientation: int = 0) -> np
         raise SceneError(f"{name}: not an image that can be read ({reason()})")
     try:
         layer = _choose(_layers(image, name), wanted, name, path)
+        image.close()
+        image = open_image(path)  # readers of some formats do not come back from a part that is not there
+        if image is None:
+            raise SceneError(f"{name}: not an image that can be read ({reason()})")
+        image.seek_subimage(layer.part, 0)
         spec = image.spec(layer.part)
+        kind = spec.channelformat(layer.channels[0]).basetype
+        if image.format_name() == "openexr" and kind == oiio.UINT32:
+            raise SceneError(
+                f"{name}: the channels of {layer.name} are whole numbers, as ids are; expected half or float"
+            )
         if spec.width < 1 or spec.height < 1:
             raise SceneError(f"{name}: the image has no pixels ({spec.width}x{spec.height})")
         orientation = orientation or spec.get_int_attribute("Orientation", 1)
@@ -150,8 +160,9 @@ def _read_pixels(path: Path, name: str, wanted: str, orientation: int = 0) -> np
     except UnicodeDecodeError as error:
         raise SceneError(f"{name}: the image is damaged, or has names that are not UTF-8; write it anew") from error
     finally:
-        image.close()
-    if spec.format.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE):
+        if image is not None:
+            image.close()
+    if kind not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE):
         for rows in bands(spec.height, spec.width):
             pixels[rows] = decode_srgb(pixels[rows])
     pixels = _upright(_in_display_window(pixels, spec), orientation)
@@ -293,22 +304,62 @@ def _read_radiance(path: Path, name: str, layer: str) -> np.ndarray:
     with path.open("rb") as file:
         data = file.read(MOST_HEADER)
     header = parse_radiance(data, name)
-    if header.is_xyz:  # the same coding, under a name that OpenImageIO refuses
+    has_runs = has_old_runs(data)
+    if header.is_xyz or has_runs:  # a name that OpenImageIO refuses, and a coding that it does not know
         with tempfile.TemporaryDirectory() as folder:
             copy = Path(folder) / "sky.hdr"
             data = path.read_bytes()
+            data = without_old_runs(data, name) if has_runs else data
             copy.write_bytes(re.sub(rb"(?m)^FORMAT=\s*32-bit_rle_xyze", b"FORMAT=32-bit_rle_rgbe", data, count=1))
             pixels = _read_pixels(copy, name, layer, header.orientation)
-        pixels = _times(pixels, RGB_FROM_XYZ.T)
     else:
         pixels = _read_pixels(path, name, layer, header.orientation)
-        if header.primaries is not None:
-            pixels = _converted(pixels, header.primaries, name)
+    if header.is_xyz:
+        pixels = _times(pixels, RGB_FROM_XYZ.T)
+    elif header.primaries is not None:
+        pixels = _converted(pixels, header.primaries, name)
     pixels = np.ascontiguousarray(pixels)
     if (header.scale != 1).any():
         for rows in bands(*pixels.shape[:2]):
             pixels[rows] = pixels[rows] / header.scale
     return pixels
+
+
+SIZE = re.compile(rb"\r?\n\r?\n[-+][XY]\s+(\d+)\s+[-+][XY]\s+(\d+)[^\n]*\n")
+"""End of the header of a Radiance picture, and its size: rows or columns, and pixels in each."""
+
+
+def has_old_runs(data: bytes) -> bool:
+    """Return whether the begin of a Radiance picture is in the run-length coding of before 1991, or in none.
+
+    Since then a row that is not as it is begins with 2, 2 and its length.
+    """
+    size = SIZE.search(data)
+    start = data[size.end() : size.end() + 4] if size else b""
+    return size is not None and len(start) == 4 and start != bytes((2, 2)) + (int(size[2]) % 65536).to_bytes(2, "big")
+
+
+def without_old_runs(data: bytes, name: str) -> bytes:
+    """Return a Radiance picture in the run-length coding of before 1991 without it; raises SceneError if it is damaged.
+
+    A pixel 1, 1, 1, n stands for n more of the one before; the next such one for 256 times its n.
+    """
+    size = SIZE.search(data)
+    if size is None:
+        return data
+    count = int(size[1]) * int(size[2])
+    check_memory(f"{name}: {count:,} pixels", 8 * count)
+    whole = len(data) - size.end() - (len(data) - size.end()) % 4
+    coded = np.frombuffer(data, np.uint8, whole, size.end()).reshape(-1, 4)
+    is_run = (coded[:, :3] == 1).all(axis=1)
+    at = np.arange(len(coded))
+    source = np.maximum.accumulate(np.where(is_run, 0, at))
+    shift = 8 * np.minimum(at - source - 1, 4)
+    repeats = np.where(is_run, coded[:, 3].astype(np.int64) << np.maximum(shift, 0), 1)
+    if len(coded) == count or (is_run[:1]).any() or int(repeats.sum()) < count:
+        return data  # no runs, or cut short, which its reader tells
+    pixels = np.repeat(source, np.minimum(repeats, count))[:count]
+    return data[: size.end()] + coded[pixels].tobytes()
 
 
 def parse_radiance(data: bytes, name: str) -> RadianceHeader:
