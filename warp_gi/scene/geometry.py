@@ -197,11 +197,3 @@ def write(flat: FlatGeometry, pieces: Iterable[tuple[np.ndarray, np.ndarray | No
 def placed_points(node: Node, pose: Pose) -> np.ndarray:
     """Return the points of ``node``'s meshes in a pose, one mesh after another, float32 [vertex, 3]."""
     return np.concatenate([pose.vertices(mesh)[0] for mesh in node.meshes])
-
-
-def triangulated(faces: np.ndarray) -> np.ndarray:
-    """Return faces [n, corners] as a fan of triangles each, int64 [m, 3]."""
-    if faces.ndim != 2 or faces.shape[1] < 3:
-        raise SceneError(f"faces must have at least 3 corners, got shape {list(faces.shape)}")
-    fans = [faces[:, [0, corner, corner + 1]] for corner in range(1, faces.shape[1] - 1)]
-    return np.stack(fans, axis=1).reshape(-1, 3).astype(np.int64)

@@ -16,8 +16,6 @@ from warp_gi.scene.environment import Sky
 from warp_gi.scene.files.from_trimesh import is_trimesh, trimesh_parts
 from warp_gi.scene.files.images import missing_file, restricted_to
 from warp_gi.scene.files.parts import SceneParts
-from warp_gi.scene.geometry import triangulated
-from warp_gi.scene.model import Material, Mesh, Node
 from warp_gi.scene.pinhole import offset_text
 from warp_gi.scene.scene import Scene
 
@@ -168,27 +166,10 @@ def _read(path: Path, suffix: str) -> SceneParts:
         from warp_gi.scene.files.ply import read_ply
 
         return read_ply(path)
-    return _read_single_mesh(path, suffix)
+    if suffix == ".stl":
+        from warp_gi.scene.files.stl import read_stl
 
+        return read_stl(path)
+    from warp_gi.scene.files.off import read_off
 
-def _read_single_mesh(path: Path, suffix: str) -> SceneParts:
-    """Read a file that holds one mesh without materials: STL or OFF."""
-    from trimesh.exchange.load import mesh_loaders
-
-    with path.open("rb") as file:
-        contents = mesh_loaders[suffix[1:]](file, file_type=suffix[1:])
-    points, faces = contents.get("vertices"), contents.get("faces")
-    if points is None or faces is None or not len(faces):
-        raise SceneError(f"{str(path)!r} holds no triangles; export it with faces")
-    normals = contents.get("vertex_normals")
-    if normals is not None and np.shape(normals) != np.shape(points):
-        normals = None
-    mesh = Mesh(
-        np.asarray(points),
-        triangulated(np.asarray(faces)),
-        Material(path.stem, specular=0.0),
-        None if normals is None else np.asarray(normals, np.float32),
-        getattr(contents.get("visual"), "uv", None),
-        path.stem,
-    )
-    return SceneParts([Node(path.stem, [mesh])])
+    return read_off(path)

@@ -15,7 +15,7 @@ from warp_gi.errors import UnsupportedWarning
 MOST_PLACES = 3
 """Number of places that a warning names; others are counted."""
 
-GLTF, OBJ, PLY = "glTF", "OBJ", "PLY"
+GLTF, OBJ, PLY, OFF, STL = "glTF", "OBJ", "PLY", "OFF", "STL"
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ FEATURES: tuple[Feature, ...] = (
         ("triangle strips", PLY, "triangles; -1 begins another strip"),
         ("default weights of morph targets", GLTF, "of the mesh and of the node, in positions and normals"),
         ("COLOR_0", GLTF, "multiplies base colour and coverage; linear"),
-        ("colours of vertices", f"{OBJ}, {PLY}", "multiply the base colour; sRGB-coded, of any type of numbers"),
+        ("colours of vertices", f"{OBJ}, {PLY}, {OFF}", "multiply the base colour; sRGB-coded, of any type of numbers"),
         ("EXT_texture_webp", GLTF, "read in the place of its stand-in"),
         ("sparse, strided and normalized accessors", GLTF, "as they are"),
         ("KHR_mesh_quantization", GLTF, "as it is"),
@@ -70,10 +70,10 @@ FEATURES: tuple[Feature, ...] = (
         ("alphaMode MASK", GLTF, "rays pass where the coverage is below the cutoff"),
         ("alphaMode BLEND", GLTF, "rays pass by chance, with the probability 1 - coverage"),
         ("coverage between 0 and 1", OBJ, "rays pass by chance; a map of holes alone is a mask with a cutoff of 0.5"),
-        ("alpha of vertex colours", PLY, "coverage: rays pass by chance"),
+        ("alpha of vertex colours", f"{PLY}, {OFF}", "coverage: rays pass by chance"),
         ("perspective cameras", GLTF, "without aspectRatio they keep their yfov in pictures of any shape"),
         ("orthographic cameras", GLTF, "their xmag in pictures of any shape; znear and zfar cut nothing off"),
-        ("polygons, concave ones too", f"{OBJ}, {PLY}", "triangles: fans, or ear clipping of concave ones"),
+        ("polygons, concave ones too", f"{OBJ}, {PLY}, {OFF}", "triangles: fans, or ear clipping of concave ones"),
         ("MTL: Kd, Ks, Ns, Ke, d, Tr, Pr, Pm and their maps", OBJ, "metallic-roughness materials"),
         ("colours of glass", f"{GLTF}, {OBJ}", "tint paths and shadow rays; bakes take their luminance"),
         ("textures named by a path of another machine", OBJ, "looked for by their bare names beside the MTL file"),
@@ -138,7 +138,7 @@ FEATURES: tuple[Feature, ...] = (
         ("EXT_lights_image_based", GLTF, "give a sky of its own"),
         ("KHR_audio_emitter", GLTF, "pictures have no sound"),
         ("smoothing groups", OBJ, "faces without normals are flat; load_scene(smooth=) and --smooth make normals"),
-        ("faces of fewer than three corners", f"{OBJ}, {PLY}", "they have no area"),
+        ("faces of fewer than three corners", f"{OBJ}, {PLY}, {OFF}", "they have no area"),
         ("free-form curves and surfaces", OBJ, "only polygons are read"),
         ("bump and displacement maps", OBJ, "the surface without them; norm is a normal map"),
         ("maps of the specular colour and exponent", OBJ, "the numbers beside them"),
@@ -152,7 +152,7 @@ FEATURES: tuple[Feature, ...] = (
         ("other statements of OBJ, such as call and usemap", OBJ, "as if they were not there"),
         ("statements of MTL without the numbers they need", OBJ, "as if they were not there"),
         ("other statements of MTL, such as decal, and Tf of what is no glass", OBJ, "as if they were not there"),
-        ("colours of faces", PLY, "only vertices have colours"),
+        ("colours of faces", f"{PLY}, {OFF}, {STL}", "only vertices have colours"),
         ("textures of PLY", PLY, "the plain colour"),
         ("other elements of PLY, such as material", PLY, "vertices, faces and triangle strips alone"),
         ("KHR_xmp_json_ld", GLTF, "a note about the file"),
