@@ -128,6 +128,18 @@ def test_names_of_buffers_that_are_encoded_or_not(uri, name, tmp_path):
     assert scene.triangle_count == 2 and not told
 
 
+@pytest.mark.parametrize("is_there", [False, True])
+def test_no_spelling_of_a_name_leads_out_of_the_folder(is_there, tmp_path):
+    """Encoded it is inside, as it stands outside: whether there is a file is not told."""
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    if is_there:
+        (tmp_path / "b.bin").write_bytes(bytes(9999))
+    as_text(square(), folder / "a.gltf", "x%2Fy/../../b.bin")
+    with pytest.raises(gi.SceneError, match="lies outside of the scene's folder"):
+        gi.load_scene(folder / "a.gltf", restrict_paths=True)
+
+
 def test_meshopt_that_has_other_data_beside_it_needs_no_decoder(tmp_path, monkeypatch):
     glb = square()
     packed = {"buffer": 0, "byteLength": 4, "byteStride": 4, "count": 1, "mode": "ATTRIBUTES"}

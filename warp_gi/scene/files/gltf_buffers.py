@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import os
 import re
 import struct
 import urllib.parse
@@ -80,15 +79,15 @@ def decode_data_uri(uri: str, what: str) -> bytes:
 
 def find_uri(folder: Path, uri: str, what: str) -> Path:
     """Return the file of a relative URI, which writers encode or do not; raises SceneError if it is missing."""
-    try:
-        return find_file(folder, urllib.parse.unquote(uri), what)
-    except OutsideError:
-        raise
-    except SceneError:
-        for other in dict.fromkeys((uri, urllib.parse.unquote(uri.partition("?")[0].partition("#")[0]))):
-            if other != urllib.parse.unquote(uri) and os.path.isfile(folder / other):
-                return find_file(folder, other, what)
-        raise
+    missing: SceneError | None = None
+    for name in dict.fromkeys((urllib.parse.unquote(uri), uri, urllib.parse.unquote(re.split("[?#]", uri)[0]))):
+        try:
+            return find_file(folder, name, what)
+        except OutsideError:
+            raise
+        except SceneError as error:
+            missing = missing or error
+    raise missing or SceneError(f"{what} {uri!r} is missing")
 
 
 class Buffers:
