@@ -60,11 +60,11 @@ def ship(name: str, folder: Path) -> Path:
     """
     kernel_cache.start()  # which names the folder of the cache anew
     target = place(name, folder)
-    for old in shipped.versions(name, target.parent):
-        shutil.rmtree(old)
     with tempfile.TemporaryDirectory() as cache:
         wp.config.kernel_cache_dir = cache
         wp.get_module(name).load(wp.get_device("cpu"), 1)
+        for old in shipped.versions(name, target.parent):
+            shutil.rmtree(old)
         target.mkdir(parents=True)
         for file in (Path(cache) / target.name).iterdir():
             if file.suffix in KEPT:
@@ -83,6 +83,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     names = options.names or shipped_modules()
     if not shipped.knows_level():
         parser.error("wheels bring kernels for x86-64-v3 on Linux, which this machine is not")
+    unknown = sorted({*names} - {*shipped_modules()})
+    if unknown and not options.check:
+        parser.error(f"no kernel module is called {unknown[0]!r}")
     if options.check:
         missing = [name for name in names if not place(name, options.folder).is_dir()]
         for name in missing:

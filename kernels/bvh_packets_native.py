@@ -9,7 +9,6 @@ coincide. Vectors are clang's portable ones, of 512 bits: two of 256 bits on CPU
 from warp_gi.kernels.bvh_native import cpu_only
 from warp_gi.kernels.bvh_queries_native import ANY_METHODS, BVH, CLOSEST_METHODS
 
-PACKET = 16  # rays
 FEW = 2  # rays that go on alone
 
 

@@ -27,6 +27,9 @@ SMALLEST = wp.constant(wp.float32(1.0e-20))  # keeps quotients finite
 MOST_LIGHT = wp.constant(wp.float32(1.0e15))  # more, or what is no number, is no light
 LARGEST_EXPONENT = wp.constant(wp.float32(12.0))  # of a tap's weight: what is farther off counts nothing
 LEAST_AROUND = wp.constant(wp.float32(8.0))  # pixels around, fewer of which tell no outlier
+MOST_ALIKE = wp.constant(
+    wp.float32(0.125)
+)  # share of the pixels around that may be outliers, too; more are other light
 LEAST_KNOWN = wp.constant(wp.float32(256.0))  # frames of all pixels around, fewer of which know no mean square
 LEAST_WEIGHT = wp.constant(wp.float32(1.0e-2))  # of history: less is a neighbour's light, which a pixel hardly touches
 
@@ -266,90 +269,6 @@ def reproject(first: wp.int32, settings: DenoiseSettings, now: Guides, before: G
     out.moments[i] = moments
 
 
-# Pixels of a block that a pixel's light is compared with and shared among: those of its surface whose light of the lobe
-# is known.
-@wp.func
-def is_around(
-    settings: DenoiseSettings,
-    guides: Guides,
-    length: wp.array(dtype=wp.vec2),
-    lobe: wp.int32,
-    i: wp.int32,
-    x: wp.int32,
-    y: wp.int32,
-) -> wp.bool:
-    if x < 0 or y < 0 or x >= settings.width or y >= settings.height:
-        return False
-    j = y * settings.width + x
-    if j == i or length[j][lobe] <= 0.0:
-        return False
-    return same_surface(settings, guides, i, guides.guide_position[i], guides, j)
-
-
-# Share out what the light of pixel i has above a limit among it and the pixels around in the block from (x0, y0).
-# The limit is a multiple of the root of the mean square of earlier light there; no pixel gets more than that root
-# itself, so that no block is seen. What is left is lost.
-@wp.func
-def share_outlier(
-    settings: DenoiseSettings,
-    guides: Guides,
-    noisy: Signals,
-    history: Signals,
-    lobe: wp.int32,
-    i: wp.int32,
-    x0: wp.int32,
-    y0: wp.int32,
-):
-    light = noisy.diffuse
-    if lobe == 1:
-        light = noisy.glossy
-    count = float(0.0)
-    frames = float(0.0)
-    square = float(0.0)
-    for k in range(BLOCK * BLOCK):
-        x = x0 + k % BLOCK
-        y = y0 + k / BLOCK
-        if is_around(settings, guides, noisy.length, lobe, i, x, y):
-            j = y * settings.width + x
-            count += 1.0
-            frames += history.length[j][lobe]
-            square += history.length[j][lobe] * history.moments[j][lobe]
-    if count < LEAST_AROUND or frames < LEAST_KNOWN:
-        return
-    own = luminance(light[i])
-    typical = wp.sqrt(square / frames)
-    limit = settings.outliers * typical
-    if own <= limit:
-        return
-    part = light[i] * (wp.min((own - limit) / (count + 1.0), typical) / own)
-    light[i] = light[i] * (limit / own) + part
-    for k in range(BLOCK * BLOCK):
-        x = x0 + k % BLOCK
-        y = y0 + k / BLOCK
-        if is_around(settings, guides, noisy.length, lobe, i, x, y):
-            j = y * settings.width + x
-            light[j] = light[j] + part
-
-
-# Thread: a block of pixels, with its pixels one after the other. Light that a single ray found, and hardly any before
-# or around, is shared out: averages over frames keep it for long as a dot. Squares stay as they were, for the filter:
-# the light is as uncertain as before.
-@wp.kernel
-def share_outliers(first: wp.int32, settings: DenoiseSettings, guides: Guides, noisy: Signals, history: Signals):
-    b = first + wp.tid()
-    columns = (settings.width + settings.shift_x + BLOCK - 1) / BLOCK
-    x0 = (b % columns) * BLOCK - settings.shift_x
-    y0 = (b / columns) * BLOCK - settings.shift_y
-    for y in range(wp.max(y0, 0), wp.min(y0 + BLOCK, settings.height)):
-        for x in range(wp.max(x0, 0), wp.min(x0 + BLOCK, settings.width)):
-            i = y * settings.width + x
-            for lobe in range(2):
-                square = noisy.moments[i][lobe]
-                known = settings.outliers * settings.outliers * history.moments[i][lobe]
-                if square > 0.0 and square > known:
-                    share_outlier(settings, guides, noisy, history, lobe, i, x0, y0)
-
-
 # By how much a block's light has changed, from sums over its pixels of: the new light less the average before, the
 # variance of that, and the larger of the two lights.
 @wp.func
@@ -410,6 +329,114 @@ def change_at(
     return top * (1.0 - fv) + bottom * fv
 
 
+# Changes of both lobes at a pixel; 0 where light is never forgotten.
+@wp.func
+def changes_at(settings: DenoiseSettings, changes: Changes, x: wp.int32, y: wp.int32) -> wp.vec2:
+    if settings.lag <= 0.0:
+        return wp.vec2(0.0, 0.0)
+    rows = changes.diffuse.shape[0] / changes.columns
+    return wp.vec2(
+        change_at(changes.diffuse, changes.columns, rows, x, y), change_at(changes.glossy, changes.columns, rows, x, y)
+    )
+
+
+# Pixels of a block that a pixel's light is compared with and shared among: those of its surface whose light of the lobe
+# is known.
+@wp.func
+def is_around(
+    settings: DenoiseSettings,
+    guides: Guides,
+    length: wp.array(dtype=wp.vec2),
+    lobe: wp.int32,
+    i: wp.int32,
+    x: wp.int32,
+    y: wp.int32,
+) -> wp.bool:
+    if x < 0 or y < 0 or x >= settings.width or y >= settings.height:
+        return False
+    j = y * settings.width + x
+    if j == i or length[j][lobe] <= 0.0:
+        return False
+    return same_surface(settings, guides, i, guides.guide_position[i], guides, j)
+
+
+# Share out what the light of pixel i has above a limit among it and the pixels around in the block from (x0, y0).
+# The limit is a multiple of the root of the mean square of earlier light there; from an outlier no pixel gets more than
+# that root itself, so that no block is seen. What is left is lost. Where many pixels are above it, or all was dark, the
+# light is another one, and stays.
+@wp.func
+def share_outlier(
+    settings: DenoiseSettings,
+    guides: Guides,
+    noisy: Signals,
+    history: Signals,
+    lobe: wp.int32,
+    i: wp.int32,
+    x0: wp.int32,
+    y0: wp.int32,
+):
+    light = noisy.diffuse
+    if lobe == 1:
+        light = noisy.glossy
+    count = float(0.0)
+    frames = float(0.0)
+    square = float(0.0)
+    for k in range(BLOCK * BLOCK):
+        x = x0 + k % BLOCK
+        y = y0 + k / BLOCK
+        if is_around(settings, guides, noisy.length, lobe, i, x, y):
+            j = y * settings.width + x
+            count += 1.0
+            frames += history.length[j][lobe]
+            square += history.length[j][lobe] * history.moments[j][lobe]
+    if count < LEAST_AROUND or frames < LEAST_KNOWN:
+        return
+    own = luminance(light[i])
+    typical = wp.sqrt(square / frames)
+    limit = settings.outliers * typical
+    if own <= limit or typical <= 0.0:
+        return
+    alike = float(0.0)
+    for k in range(BLOCK * BLOCK):
+        x = x0 + k % BLOCK
+        y = y0 + k / BLOCK
+        if is_around(settings, guides, noisy.length, lobe, i, x, y):
+            if noisy.moments[y * settings.width + x][lobe] > limit * limit:
+                alike += 1.0
+    if alike > MOST_ALIKE * count:
+        return
+    part = light[i] * (wp.min((own - limit) / (count + 1.0), typical) / own)
+    light[i] = light[i] * (limit / own) + part
+    for k in range(BLOCK * BLOCK):
+        x = x0 + k % BLOCK
+        y = y0 + k / BLOCK
+        if is_around(settings, guides, noisy.length, lobe, i, x, y):
+            j = y * settings.width + x
+            light[j] = light[j] + part
+
+
+# Thread: a block of pixels, with its pixels one after the other. Light that a single ray found, and hardly any before
+# or around, is shared out: averages over frames keep it for long as a dot. Squares stay as they were, for the filter:
+# the light is as uncertain as before.
+@wp.kernel
+def share_outliers(
+    first: wp.int32, settings: DenoiseSettings, guides: Guides, noisy: Signals, history: Signals, changes: Changes
+):
+    b = first + wp.tid()
+    columns = (settings.width + settings.shift_x + BLOCK - 1) / BLOCK
+    x0 = (b % columns) * BLOCK - settings.shift_x
+    y0 = (b / columns) * BLOCK - settings.shift_y
+    for y in range(wp.max(y0, 0), wp.min(y0 + BLOCK, settings.height)):
+        for x in range(wp.max(x0, 0), wp.min(x0 + BLOCK, settings.width)):
+            i = y * settings.width + x
+            change = changes_at(settings, changes, x, y)
+            for lobe in range(2):
+                square = noisy.moments[i][lobe]
+                known = settings.outliers * settings.outliers * history.moments[i][lobe]
+                if square > 0.0 and square > known and change[lobe] == 0.0:
+                    share_outlier(settings, guides, noisy, history, lobe, i, x0, y0)
+
+
 # Frames of an average that are kept when a frame is added that is worth `new` of them; there are at most `most`.
 @wp.func
 def kept_frames(length: wp.float32, new: wp.float32, most: wp.float32, change: wp.float32) -> wp.float32:
@@ -434,12 +461,9 @@ def add_frame(
     fresh = noisy.length[i]
     moments = history.moments[i]
     change = wp.vec2(0.0, 0.0)
-    if settings.lag > 0.0 and length[0] + length[1] > 0.0:
+    if length[0] + length[1] > 0.0:
         y = i / settings.width
-        x = i - y * settings.width
-        rows = changes.diffuse.shape[0] / changes.columns
-        change[0] = change_at(changes.diffuse, changes.columns, rows, x, y)
-        change[1] = change_at(changes.glossy, changes.columns, rows, x, y)
+        change = changes_at(settings, changes, i - y * settings.width, y)
     if fresh[0] > 0.0:
         kept = kept_frames(length[0], fresh[0], settings.diffuse_frames, change[0])
         a = fresh[0] / (kept + fresh[0])

@@ -89,7 +89,7 @@ def full_disk(objects, monkeypatch):
     def copy(*arguments, **more):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(shipped.shutil, "copytree", copy)
+    monkeypatch.setattr(shipped.shutil, "copyfile", copy)
 
 
 @pytest.mark.parametrize("spoil", [another_key, old_processor, asked_for_none, flags_of_the_user, full_disk])

@@ -53,6 +53,7 @@ _PUBLIC = {
     "SpatioTemporal": "warp_gi.denoise",
     "Oidn": "warp_gi.denoise",
     "bake": "warp_gi.rendering",
+    "merge_bakes": "warp_gi.shards",
     "FrameScheduler": "warp_gi.scheduler",
     "Frame": "warp_gi.frame",
     "render": "warp_gi.rendering",

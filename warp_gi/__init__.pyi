@@ -54,6 +54,7 @@ from warp_gi.scheduler import FrameScheduler as FrameScheduler
 from warp_gi.sequence.frames import read_frame as read_frame
 from warp_gi.sequence.frames import write_frame as write_frame
 from warp_gi.sequence.resume import Plan as Plan
+from warp_gi.shards import merge_bakes as merge_bakes
 from warp_gi.stateful import Service as Service
 from warp_gi.techniques.light_field.estimator import LightFieldProbes as LightFieldProbes
 from warp_gi.techniques.light_hierarchy.estimator import LightHierarchy as LightHierarchy

@@ -30,6 +30,7 @@ FORMAT_VERSION = 2
 _TEXTS = ("technique", "scene_key", "scene_name")
 _WHOLE = tuple(f"{kind}{bits}" for kind in ("uint", "int") for bits in (8, 16, 32, 64))
 _TYPES = ("bool", *_WHOLE, "float16", "float32", "float64")
+_SHARD = re.compile(r"(.+), shard (\d{1,7}) of (\d{1,7})")
 
 
 @dataclass(eq=False)
@@ -37,7 +38,7 @@ class Bake:
     """Results that an estimator computed before the first frame, and the scene and settings that they are valid for."""
 
     technique: str
-    """Class name of the estimator."""
+    """Class name of the estimator; of a shard with its number, as "VisibilityField, shard 2 of 3"."""
     scene_key: str
     """Hash of just what the bake depends on; for visibility ``Scene.geometry_hash``."""
     settings: dict[str, Any]
@@ -103,11 +104,20 @@ class Bake:
         """Return whether the bake was made with these settings."""
         return self.settings == dict(settings)
 
+    def check_whole(self) -> None:
+        """Raise BakeError for a shard of a bake."""
+        if found := shard_of(self.technique):
+            name, number, count = found
+            raise BakeError(
+                f"this is shard {number} of {count} of a bake by {name!r}: merge all {count} first (warp-gi merge)"
+            )
+
     def check(self, technique: str, scene_key: str, settings: Mapping[str, Setting], scene_name: str = "") -> None:
         """Raise BakeError saying why, unless the bake is by ``technique``, of this scene and with these settings.
 
         For a scene of the same name other settings come first: the hash of what a bake depends on may follow from them.
         """
+        self.check_whole()
         if technique != self.technique:
             raise BakeError(
                 f"this bake is by {self.technique!r}, not by {technique!r}: name its own file or bake it again"
@@ -171,6 +181,12 @@ def load_bake(path: str | Path) -> Bake:
         return Bake(technique, scene_key, settings, arrays, counts, scene_name)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise _damaged(path) from error
+
+
+def shard_of(technique: str) -> tuple[str, int, int] | None:
+    """Return class name, number and count of a bake's ``technique`` that names a shard; None of a whole bake."""
+    found = _SHARD.fullmatch(technique)
+    return None if found is None else (found[1], int(found[2]), int(found[3]))
 
 
 def settings_in(path: str | Path) -> dict[str, Setting]:

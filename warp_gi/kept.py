@@ -172,6 +172,7 @@ def bakes_by_class(bakes: Iterable[Bake], parts: dict[str, Stateful]) -> dict[st
     users = [part for part in parts.values() if isinstance(part, Estimator | RadianceCache)]
     found: dict[str, list[Bake]] = {type(part).__name__: [] for part in users}
     for one in bakes:
+        one.check_whole()
         if one.technique not in found:
             names = ", ".join(sorted(found)) or "none"
             raise BakeError(

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from warp_gi.errors import OptionError, SceneError
+from warp_gi.errors import SceneError
 
 if TYPE_CHECKING:
     import warp as wp
@@ -39,20 +39,6 @@ def check_memory(what: str, needed: int) -> None:
         raise SceneError(
             f"{what} take {gigabytes(needed)} of memory, and {gigabytes(free)} are free; make it smaller, or use a"
             " machine with more"
-        )
-
-
-def check_picture(resolution: tuple[int, int], is_denoised: bool, device: wp.Device) -> None:
-    """Raise OptionError for a picture that does not fit into the memory that the device has left.
-
-    Counted are its own buffers, those of a denoiser and its history, and on the CPU the file that is written. What
-    scene and bakes take is not known yet.
-    """
-    needed, free = picture_bytes(resolution, is_denoised), left_on(device)
-    if free is not None and needed > free:
-        raise OptionError(
-            f"{too_large(resolution, is_denoised)}, and {gigabytes(free)} are free on {device.alias}; render fewer"
-            " pixels" + (", or without a denoiser" if is_denoised else "")
         )
 
 

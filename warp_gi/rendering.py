@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Container, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
@@ -22,6 +23,7 @@ from warp_gi.scheduler import FrameScheduler
 from warp_gi.sequence.chunks import chunk_of, run_of
 from warp_gi.sequence.frame_time import check_seconds, samples_within, take_time
 from warp_gi.sequence.resume import Output, Plan, SequenceRun, shots_of
+from warp_gi.shards import bake_shard, check_shardable
 from warp_gi.stateful import Stateful
 
 if TYPE_CHECKING:
@@ -214,6 +216,7 @@ def bake(
     *,
     camera_path: Camera | CameraPath | None = None,
     cache: BakeFolder | str | Path | None = None,
+    chunk: str | tuple[int, int] | None = None,
 ) -> Bake:
     """Return what an estimator can know of a scene before the first frame, to be saved and used again.
 
@@ -227,24 +230,32 @@ def bake(
         progress: Called with (stage, share done in [0, 1]); True shows a line on stderr, in a notebook too.
         camera_path: Another name of ``camera``.
         cache: Folder in which bakes that take long are kept, and found the next time; None keeps none.
+        chunk: A shard of the bake, as "3/16" or (3, 16), for several processes; ``gi.merge_bakes`` makes the whole of
+            all. Shards are not kept in ``cache``. VisibilityField has shards, others have none yet.
 
-    Raises OptionError for a device that is not there, an estimator that has nothing to bake, or both ``camera`` and
-    ``camera_path``; SceneError for a scene that was edited after it was built.
+    Raises OptionError for a device that is not there, an estimator that has nothing to bake, or no shards though one is
+    asked for, or both ``camera`` and ``camera_path``; SceneError for a scene that was edited after it was built.
     """
     if camera is not None and camera_path is not None:
         raise OptionError("camera and camera_path are two names of one argument; give camera")
     camera = camera_path if camera is None else camera
     if camera is not None:
         camera = camera.relative_to(scene.offset)
+    part = chunk_of(chunk)
+    if part is not None:
+        check_shardable(estimator)
 
     def make() -> Bake | None:
-        return estimator.bake(scene, device, seed, told and (lambda share: told("bake", share)), camera)
+        tell = None if told is None else partial(told, "bake")
+        if part is not None:
+            return bake_shard(scene, estimator, part, device, seed, camera, tell)
+        return estimator.bake(scene, device, seed, tell, camera)
 
     with shown(progress) as told, scene.lock:
         scene.check_unchanged()
         scene.update_sky(sky_start(scene.sky_at))
         scene.update(0.0, None, device)
-        result = cached_bake(cache, estimator, scene, camera, launch.get_device(device), seed, make)
+        result = cached_bake(None if part else cache, estimator, scene, camera, launch.get_device(device), seed, make)
     if result is None and isinstance(estimator, Estimator) and estimator.radiance_cache is not None:
         raise OptionError(
             f"{type(estimator).__name__} has nothing to bake, but the cache has that its paths end in: bake its ends_in"

@@ -253,9 +253,9 @@ class FrameScheduler:
         with timed(timings, "scene", self.device):
             frame = self._new_frame(index, previous_index, partial(bands.BandFrame, rows=rows))
         frame.timings = timings
-        self._traced(frame)
+        states = self._traced(frame)
         if rows.stop == self.camera.resolution[1]:
-            self._trail = self.scene.trail_of(index, self.device)
+            self._states, self._trail = states, self.scene.trail_of(index, self.device)
         frame.finish()
         return frame
 

@@ -14,6 +14,7 @@ import platform
 import re
 import shutil
 import sys
+import uuid
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -85,10 +86,12 @@ def bring(module: Any, more: str) -> bool:
 
 def _copy(source: Path, target: Path) -> None:
     """Copy a folder, so that it appears whole or not at all, unless it is there."""
-    part = target.with_name(f".{target.name}.{os.getpid()}")
+    part = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}")
     try:
         if not target.is_dir():
-            shutil.copytree(source, part, dirs_exist_ok=True)
+            part.mkdir()
+            for file in source.iterdir():
+                shutil.copyfile(file, part / file.name)  # without its mode: an installed file may be read-only
             with contextlib.suppress(FileExistsError, NotADirectoryError):
                 part.rename(target)
     except OSError:

@@ -156,6 +156,27 @@ class Stateful:
         """
         return None
 
+    def bake_shard(
+        self,
+        scene: Scene,
+        device: str,
+        seed: int,
+        shard: tuple[int, int],
+        progress: Callable[[float], None] | None = None,
+        camera: Camera | CameraPath | None = None,
+    ) -> Bake | None:
+        """Return a part of what ``bake`` returns, so that ``merge_shards`` of all parts is equal to it, bit for bit.
+
+        ``shard`` is the number of the part, from 1, and the number of parts. Only those that override this and
+        ``merge_shards`` can be baked in shards (``warp_gi.shards``).
+        """
+        raise NotImplementedError
+
+    @classmethod
+    def merge_shards(cls, shards: Sequence[Bake]) -> Bake:
+        """Return the whole bake of all shards, in the order of their numbers, of one scene, seed and settings."""
+        raise NotImplementedError
+
     def check_view(self, bake: Bake, camera: Camera | CameraPath) -> None:
         """Warn if a bake of this scene and these settings was made for another camera than will look at it."""
 

@@ -32,6 +32,8 @@ from warp_gi.rendering import bake
 from warp_gi.scene.camera import Camera, CameraPath
 from warp_gi.scene.files.sky_images import split_layer
 from warp_gi.scene.scene import Scene
+from warp_gi.sequence.chunks import chunk_of
+from warp_gi.shards import check_shardable
 from warp_gi.stateful import Stateful
 from warp_gi.techniques.bake_tool import BakeTool, ExportRequest, ExportSettings
 
@@ -56,6 +58,8 @@ class BakeOptions(SceneOptions):
     """Sky of the scene, as in render. A bake may hold its light, or only the pictures show it; see above."""
     technique: Annotated[str, flag("NAME", DEFAULT_TECHNIQUE)] = DEFAULT_TECHNIQUE
     """Technique to bake for, by its long or short name; see above. The flags below are its settings."""
+    chunk: Annotated[str, flag("I/N", "all of it")] = ""
+    """Shard of the bake to make, as 3/16, beside processes that make the others; warp-gi merge makes one of all."""
     everywhere: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Bake all of the scene, where a technique otherwise bakes what the camera path sees."""
     picture: Annotated[str, flag("WxH", "the camera's own")] = ""
@@ -67,7 +71,8 @@ class BakeOptions(SceneOptions):
     threads: Annotated[int | None, flag("N", "every core")] = None
     """Number of threads on the CPU. The bake does not depend on it."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE", help_behavior_hint="")] = None
-    """File of the bake (default: out/NAME.SHORT.safetensors, with the short name of the technique)."""
+    """File of the bake (default: out/NAME.SHORT.safetensors, with the short name of the technique; of a shard
+    out/NAME.SHORT.chunk-I-of-N.safetensors)."""
     show: Annotated[Path | None, flag("FOLDER", "none")] = None
     """Folder for pictures of the bake; they are described above."""
     export: Annotated[Path | None, flag("FILE", "none")] = None
@@ -161,6 +166,7 @@ def run(options: BakeOptions, report: Reporter) -> None:
     if options.seed < 0:
         raise OptionError(f"seed must be 0 or above, got {options.seed}")
     tool.check(options.settings, options.everywhere)
+    check_chunk(options)
     output = options.output or default_output(options)
     if output.suffix.lower() != BAKE_SUFFIX:
         raise OptionError(f"cannot write {output.name}: bakes are .safetensors files")
@@ -200,6 +206,7 @@ def run(options: BakeOptions, report: Reporter) -> None:
             camera if is_of_view and not options.everywhere else None,
             lambda stage, share: tell(share),
             cache=BakeFolder() if options.cache else None,
+            chunk=options.chunk or None,
         )
     compiled = launch.compile_seconds - compiled
     seconds = time.perf_counter() - started - compiled
@@ -226,6 +233,17 @@ def run(options: BakeOptions, report: Reporter) -> None:
     if advice := tool.advice(result, options.settings):
         report.line(advice)
     report.line(f"bake: {output}")
+
+
+def check_chunk(options: BakeOptions) -> None:
+    """Raise OptionError for a shard of what has none, and for what is made of whole bakes alone."""
+    if not options.chunk:
+        return
+    chunk_of(options.chunk)
+    check_shardable(options.settings)
+    for name in ("show", "export", "view"):
+        if getattr(options, name) is not None:
+            raise OptionError(f"--{name} is of a whole bake, and --chunk makes a shard: leave one of them out")
 
 
 def check_files(options: BakeOptions, files: Sequence[Path]) -> None:
@@ -260,4 +278,6 @@ def first_view(camera: Camera | CameraPath) -> Camera:
 def default_output(options: BakeOptions) -> Path:
     """Return where the bake goes unless told."""
     name = re.sub(r"[^\w.-]+", "_", Path(options.scene or DEFAULT_SCENE).stem) or "scene"
-    return Path("out") / f"{name}.{BAKEABLE[options.technique].short}{BAKE_SUFFIX}"
+    part = chunk_of(options.chunk)
+    shard = f".{part.name}" if part else ""
+    return Path("out") / f"{name}.{BAKEABLE[options.technique].short}{shard}{BAKE_SUFFIX}"

@@ -33,6 +33,7 @@ class Command:
 COMMANDS = {
     "render": Command("warp_gi.cli.render", "render a sequence of frames to EXR files, with PNG previews"),
     "bake": Command("warp_gi.cli.bake", "compute once what an estimator needs, and save it"),
+    "merge": Command("warp_gi.cli.merge", "make one bake of the shards that several processes made"),
     "compare": Command("warp_gi.cli.compare", "measure how far a picture is from its reference"),
     "video": Command("warp_gi.cli.video", "make a film of the frames of a sequence"),
     "info": Command("warp_gi.cli.info", "print what a scene holds"),

@@ -71,8 +71,8 @@ class SpatioTemporal(Denoiser):
 
     outliers: float = 6.0
     """Times the root mean square of earlier light around a pixel, in a block of 8x8 and on its surface, above which its
-    new light is shared out there: what one ray of many found would stay as a dot. No pixel gets more than the root mean
-    square itself: above some 70 times of it, light is lost. 0 never shares."""
+    new light is shared out there: what one ray of many found would stay as a dot. From it no pixel gets more than the
+    root mean square itself: above some 70 times of that, light is lost. 0 never shares."""
 
     first_samples: int = 4
     """Samples a pixel, at least, of a frame without a frame before, 1 to 65536: the first one, a still, or after a cut.
@@ -180,7 +180,7 @@ class SpatioTemporal(Denoiser):
         changes.glossy = wp.empty_like(changes.diffuse)
         if self.lag > 0:
             frame.launch(denoise.find_changes, [settings, noisy, average, changes], columns * rows)
-        self._share(frame, settings, guides, noisy, average)  # what is shared out would look like a change of a block
+        self._share(frame, settings, guides, noisy, average, changes)  # after it: shares look like a change of a block
         frame.launch(denoise.add_frame, [settings, noisy, average, changes, average])
         return average, changes if self.lag > 0 else None
 
@@ -191,6 +191,7 @@ class SpatioTemporal(Denoiser):
         guides: denoise.Guides,
         noisy: denoise.Signals,
         history: denoise.Signals,
+        changes: denoise.Changes,
     ) -> None:
         """Share out light that a single sample found; blocks begin elsewhere in each frame, so that none is seen."""
         if self.outliers > 0:
@@ -199,7 +200,7 @@ class SpatioTemporal(Denoiser):
             settings.outliers, settings.shift_x, settings.shift_y = self.outliers, int(shifts[0]), int(shifts[1])
             width, height = frame.camera.resolution
             count = math.ceil((width + shifts[0]) / block) * math.ceil((height + shifts[1]) / block)
-            frame.launch(denoise.share_outliers, [settings, guides, noisy, history], count)
+            frame.launch(denoise.share_outliers, [settings, guides, noisy, history, changes], count)
 
     def _reflect(
         self,

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from warp_gi import bands
+from warp_gi.errors import OptionError
 from warp_gi.files import replacing
 from warp_gi.scene.camera import Camera, frame_time
 from warp_gi.sequence.exr import Attribute, channel_names, stored_format, stored_values, write_channels
@@ -154,6 +156,9 @@ def bands_of(scheduler: FrameScheduler, index: int, previous_index: int) -> Iter
     height = scheduler.camera.resolution[1]
     with scheduler.scene.lock:
         scheduler.scene.check_unchanged()
+        why = bands.why_whole(scheduler.pipeline, scheduler.scene)
+        if why:  # since the scheduler was made, the scene has been edited
+            raise OptionError(f"a picture that is larger than it may be cannot be rendered in bands any more ({why})")
         scheduler.bake(frame_time(scheduler.camera, index))
         for first in range(0, height, scheduler.rows):
             yield scheduler.band(index, previous_index, range(first, min(first + scheduler.rows, height)))
@@ -169,7 +174,7 @@ def render_in_bands(
 ) -> BandedFrame:
     """Render a frame in bands, write its preview and its file ``path``, and return it.
 
-    ``origin`` goes to the metadata. Raises OSError for files that cannot be written: then there are none.
+    ``origin`` goes to the metadata. Raises OSError for files that cannot be written: then there is no EXR file.
     """
     frame: BandedFrame | None = None
     with contextlib.ExitStack() as stack:

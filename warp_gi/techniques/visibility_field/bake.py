@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -231,8 +232,7 @@ class FieldBaker:
         """Return masks, uint32 [cell, words], and flags, int32 [cell] (SLOT_LABEL or 0), of ``pieces.cells``."""
         count = len(pieces.cells)
         masks, flags = np.empty((count, self.words), np.uint32), np.empty(count, np.int32)
-        cumulative = np.append(0.0, np.cumsum(pieces.areas))
-        areas = np.diff(cumulative[pieces.starts])
+        areas = running_sums(pieces.areas, pieces.starts)[pieces.starts[1:] - 1]
         least = 1 if self.settings.samples else LEAST_SAMPLES
         by_area = np.clip(np.ceil(self.density * areas), least, MOST_SAMPLES).astype(np.int64)
         edges = np.append(0, np.cumsum(pieces.edge_counts, dtype=np.int64))
@@ -259,8 +259,6 @@ class FieldBaker:
         first, last = pieces.starts[begin], pieces.starts[end]
         starts = pieces.starts[begin : end + 1] - first
         slot = np.repeat(np.arange(end - begin), np.diff(starts))
-        cumulative = np.cumsum(pieces.areas[first:last])
-        cumulative -= (cumulative - pieces.areas[first:last])[starts[:-1]][slot]
         edges = np.cumsum(pieces.edge_counts[first:last], dtype=np.int64)
         edges -= (edges - pieces.edge_counts[first:last])[starts[:-1]][slot]
         surfaces = bake_kernels.CellSurfaces()
@@ -268,7 +266,7 @@ class FieldBaker:
         surfaces.cell = wp.array(pieces.cells[begin:end], dtype=wp.int32, device=device)
         surfaces.piece_start = wp.array(starts, dtype=wp.int32, device=device)
         surfaces.side = wp.array(pieces.sides[first:last], dtype=wp.int32, device=device)
-        surfaces.area = wp.array(cumulative, dtype=wp.float32, device=device)
+        surfaces.area = wp.array(running_sums(pieces.areas[first:last], starts), dtype=wp.float32, device=device)
         surfaces.edges = wp.array(edges, dtype=wp.int32, device=device)
         surfaces.area_count = wp.array(by_area, dtype=wp.int32, device=device)
         surfaces.step = wp.array(_golden_steps(by_area), dtype=wp.int32, device=device)
@@ -314,6 +312,17 @@ class FieldBaker:
             self.rays_traced += int(chunks.traced.numpy().sum(dtype=np.int64))
             self.rays_asked += int((round_ends - round_begins).sum()) * self.rays
         return merge.masks.numpy().reshape(count, self.words), merge.flags.numpy()
+
+
+def running_sums(values: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Return the sum of ``values`` up to each of them within its run, float64 [value]; runs begin at ``starts``.
+
+    Each run is summed alone: the rounding of a cell's sums is the same whichever cells are baked beside it.
+    """
+    sums = np.empty(len(values), np.float64)
+    for first, last in itertools.pairwise(starts.tolist()):
+        np.cumsum(values[first:last], out=sums[first:last])
+    return sums
 
 
 def _golden_steps(counts: np.ndarray) -> np.ndarray:

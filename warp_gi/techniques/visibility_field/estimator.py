@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -24,6 +24,7 @@ from warp_gi.stateful import Forecast
 from warp_gi.techniques.visibility_field.bake import field_query, grid_of
 from warp_gi.techniques.visibility_field.cost import TOLD_SECONDS, bake_seconds, traced_seconds
 from warp_gi.techniques.visibility_field.settings import MaskSettings
+from warp_gi.techniques.visibility_field.shards import merged
 from warp_gi.techniques.visibility_field.state import (
     RAYS_A_MILLISECOND,
     FieldState,
@@ -179,6 +180,32 @@ class VisibilityField(Estimator):
         cells = cells_on_path(state, camera) if self.lazy and camera is not None else None
         state.bake(cells, progress)
         return state.to_bake()
+
+    def bake_shard(
+        self,
+        scene: Scene,
+        device: str,
+        seed: int,
+        shard: tuple[int, int],
+        progress: Callable[[float], None] | None = None,
+        camera: Camera | CameraPath | None = None,
+    ) -> Bake | None:
+        """Return the masks of every N-th of the cells that ``bake`` would look at, beginning with the shard's own."""
+        if not self.uses_cells:
+            return None
+        state = FieldState(scene, launch.get_device(device), self.mask_settings, seed)
+        if self.lazy and camera is not None:
+            cells = cells_on_path(state, camera)
+        else:
+            cells = np.arange(state.grid.cell_count, dtype=np.int32)
+        number, count = shard
+        state.bake(cells[number - 1 :: count], progress)
+        return state.to_bake()
+
+    @classmethod
+    def merge_shards(cls, shards: Sequence[Bake]) -> Bake:
+        """Return the masks of the cells of all shards. Raises BakeError for shards of other cells."""
+        return merged(shards)
 
     def start(self, scene: Scene | BakedScene, device: str, bake: Bake | None = None, seed: int = 0) -> FieldState:
         """Return the state of a field with the masks of a bake."""
