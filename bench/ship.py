@@ -80,10 +80,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--folder", type=Path, default=shipped.OBJECTS, help="default: the one that the package reads")
     parser.add_argument("--check", action="store_true", help="only say what is missing; exit code 1 if anything is")
     options = parser.parse_args(arguments)
-    names = options.names or shipped_modules()
+    known = shipped_modules()
+    names = options.names or known
     if not shipped.knows_level():
         parser.error("wheels bring kernels for x86-64-v3 on Linux, which this machine is not")
-    unknown = sorted({*names} - {*shipped_modules()})
+    unknown = sorted({*names} - {*known})
     if unknown and not options.check:
         parser.error(f"no kernel module is called {unknown[0]!r}")
     if options.check:

@@ -9,13 +9,11 @@ kernels run over the items of these rows alone. That is for pipelines whose pixe
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
-from warp_gi import launch
 from warp_gi.errors import OptionError
 from warp_gi.frame import Frame
 from warp_gi.kernels.gbuffer import TILE
@@ -52,19 +50,8 @@ class BandFrame(Frame):
         values = buffer.band.numpy()
         return values.reshape(len(self.rows), -1, *values.shape[1:])
 
-    def launch(self, kernel: wp.Kernel, inputs: Sequence[object], count: int | None = None) -> None:
-        """Run a kernel over ``count`` items, or over every pixel of the rows."""
-        if count is not None:
-            super().launch(kernel, inputs, count)
-            return
-        width = self.camera.resolution[0]
-        launch.launch(kernel, len(self.rows) * width, inputs, self.device, first=self.rows.start * width)
-
-    def launch_tiled(self, kernel: wp.Kernel, inputs: Sequence[object], share: int = 1) -> None:
-        """Run a kernel over every pixel of the rows in tiles."""
-        each = math.ceil(self.camera.resolution[0] / TILE) * int(TILE**2) // share
-        count, least = math.ceil(len(self.rows) / TILE) * each, max(launch.SMALLEST_SLICE // share, 1)
-        launch.launch(kernel, count, inputs, self.device, least, first=self.rows.start // int(TILE) * each)
+    def _rows(self) -> range:
+        return self.rows
 
 
 def band_rows(

@@ -310,8 +310,11 @@ class Frame:
 
     def launch(self, kernel: wp.Kernel, inputs: Sequence[object], count: int | None = None) -> None:
         """Run a kernel over ``count`` items, or over every pixel."""
-        width, height = self.camera.resolution
-        launch.launch(kernel, width * height if count is None else count, inputs, self.device)
+        if count is not None:
+            launch.launch(kernel, count, inputs, self.device)
+            return
+        width, rows = self.camera.resolution[0], self._rows()
+        launch.launch(kernel, len(rows) * width, inputs, self.device, first=rows.start * width)
 
     @property
     def tiled_items(self) -> int:
@@ -321,8 +324,14 @@ class Frame:
 
     def launch_tiled(self, kernel: wp.Kernel, inputs: Sequence[object], share: int = 1) -> None:
         """Run a kernel over every pixel in tiles (``kernels.gbuffer.tiled_pixel``), ``share`` pixels in each item."""
-        least = max(launch.SMALLEST_SLICE // share, 1)
-        launch.launch(kernel, self.tiled_items // share, inputs, self.device, least)
+        side, rows, least = int(gbuffer.TILE), self._rows(), max(launch.SMALLEST_SLICE // share, 1)
+        each = math.ceil(self.camera.resolution[0] / side) * side**2 // share  # items of a row of tiles
+        count, first = math.ceil(len(rows) / side) * each, rows.start // side * each
+        launch.launch(kernel, count, inputs, self.device, least, first)
+
+    def _rows(self) -> range:
+        """Return the rows of the picture that this frame has; the first is a multiple of the height of tiles."""
+        return range(self.camera.resolution[1])
 
     def trace_paths(self) -> None:
         """Trace the terms that estimators asked for in this camera sample, in one launch (``PathRequest``)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import warnings
 from dataclasses import replace
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scene_tools import GlbBuilder, card, png
 
 import warp_gi as gi
@@ -263,6 +265,21 @@ def test_a_texture_has_coordinates_of_its_own(number, tmp_path):
             s, t = 0.2 + 0.6 * s, 0.3 + 0.6 * t
         moved = 0.25 + 0.25 * t, 0.6 - 0.5 * s  # rotated by a quarter: (u, v) = (scale v, -scale u)
         np.testing.assert_allclose(frame.numpy("emission")[y, x, :2], decode_srgb(ramp_value(*moved) / 255), atol=0.02)
+
+
+def test_a_webp_texture_is_read_in_the_place_of_its_stand_in(tmp_path):
+    glb, file = square(), io.BytesIO()
+    Image.fromarray(np.full((4, 4, 3), (200, 100, 50), np.uint8)).save(file, "WEBP", lossless=True)
+    webp = glb.add("images", {"bufferView": glb.view(file.getvalue()), "mimeType": "image/webp"})
+    texture = image(glb, np.zeros((4, 4, 3)))
+    glb.json["textures"][texture]["extensions"] = {"EXT_texture_webp": {"source": webp}}
+    glb.json["extensionsUsed"] = ["EXT_texture_webp"]
+    material = glb.add("materials", {"pbrMetallicRoughness": {"baseColorTexture": {"index": texture}}})
+    glb.json["meshes"][0]["primitives"][0]["material"] = material
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        (mesh,) = loaded(glb, tmp_path).nodes[0].meshes
+    assert (mesh.material.base_color_texture.pixels[..., :3] == (200, 100, 50)).all()
 
 
 def test_a_normal_map_has_coordinates_of_its_own(tmp_path):

@@ -174,12 +174,7 @@ class VisibilityField(Estimator):
         camera: Camera | CameraPath | None = None,
     ) -> Bake | None:
         """Return the masks of all cells, or, when ``lazy`` and there is a camera, of those that it sees."""
-        if not self.uses_cells:
-            return None
-        state = FieldState(scene, launch.get_device(device), self.mask_settings, seed)
-        cells = cells_on_path(state, camera) if self.lazy and camera is not None else None
-        state.bake(cells, progress)
-        return state.to_bake()
+        return self._baked(scene, device, seed, None, progress, camera)
 
     def bake_shard(
         self,
@@ -191,15 +186,26 @@ class VisibilityField(Estimator):
         camera: Camera | CameraPath | None = None,
     ) -> Bake | None:
         """Return the masks of every N-th of the cells that ``bake`` would look at, beginning with the shard's own."""
+        number, count = shard
+        return self._baked(scene, device, seed, slice(number - 1, None, count), progress, camera)
+
+    def _baked(
+        self,
+        scene: Scene,
+        device: str,
+        seed: int,
+        part: slice | None,
+        progress: Callable[[float], None] | None,
+        camera: Camera | CameraPath | None,
+    ) -> Bake | None:
+        """Return the masks of the cells to look at, or of a part of them; None if no cells are used."""
         if not self.uses_cells:
             return None
         state = FieldState(scene, launch.get_device(device), self.mask_settings, seed)
-        if self.lazy and camera is not None:
-            cells = cells_on_path(state, camera)
-        else:
-            cells = np.arange(state.grid.cell_count, dtype=np.int32)
-        number, count = shard
-        state.bake(cells[number - 1 :: count], progress)
+        cells = cells_on_path(state, camera) if self.lazy and camera is not None else None
+        if part is not None:
+            cells = (np.arange(state.grid.cell_count, dtype=np.int32) if cells is None else cells)[part]
+        state.bake(cells, progress)
         return state.to_bake()
 
     @classmethod
